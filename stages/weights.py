@@ -3,8 +3,7 @@
 import functools
 
 from polarnet.config.tree import Config, hydra_stage, or_exit, with_lpips
-from polarnet.metrics.lpips import PURPOSES
-from polarnet.metrics.lpips_weights import find_weights, write_weights
+from polarnet.metrics.lpips import PURPOSES, find_weights, write_weights
 
 
 @hydra_stage

@@ -46,7 +46,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.engine.history import read_history
+from polarnet.training.engine.recorder import read_history
 from studies.study import ROOT, arguments_of, command_line, machine_record, run_stage, write_section
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line

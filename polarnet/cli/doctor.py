@@ -13,8 +13,7 @@ from polarnet.cli.project import settings_root
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.methods import METHODS
-from polarnet.metrics.lpips import BACKBONES
-from polarnet.metrics.lpips_weights import local_source
+from polarnet.metrics.lpips import BACKBONES, local_source
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256

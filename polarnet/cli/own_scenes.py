@@ -15,8 +15,7 @@ from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, with_lpips
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import NO_RECORD
-from polarnet.metrics.lpips_weights import Weights, find_weights
+from polarnet.metrics.lpips import NO_RECORD, Weights, find_weights
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest

@@ -12,7 +12,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.config.origins import first_difference
-from polarnet.training.engine.history import HISTORY, best_row, read_history
+from polarnet.training.engine.recorder import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""

@@ -11,7 +11,7 @@ from polarnet.benchmark.row_results import read_record, read_rows
 from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
 from polarnet.config.tree import DOLP_TRAINING, Config
 from polarnet.metrics.lpips import NO_RECORD, stored_record
-from polarnet.training.engine.history import HISTORY
+from polarnet.training.engine.recorder import HISTORY
 
 
 def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:

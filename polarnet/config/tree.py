@@ -24,8 +24,7 @@ from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.sharpening import SharpeningConfig
 from polarnet.methods.stokes_gain import GainConfig
-from polarnet.metrics.lpips import BACKBONES, PURPOSES, Purpose, is_stored
-from polarnet.metrics.lpips_weights import LpipsConfig, local_source
+from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, is_stored, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap

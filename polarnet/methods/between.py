@@ -27,9 +27,9 @@ from torch.nn import functional as F
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.networks.polarnet.fine_structure import MAX_DOLP
 from polarnet.networks.polarnet.panorama import displacements
 from polarnet.networks.polarnet.redundancy import box_means
+from polarnet.networks.polarnet.refinement import MAX_DOLP
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 

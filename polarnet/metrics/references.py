@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from polarnet.metrics.similarity import mean_where
 from polarnet.stokes import Prediction
 
 Frames = Float[Tensor, "n h w"]
@@ -36,36 +37,21 @@ def zeros(truth: Frames, valid: Valid, train_mean: float | None) -> Prediction:
 def constant(truth: Frames, valid: Valid, train_mean: float | None) -> Prediction:
     """The mean DoLP of the training split everywhere; ValueError if it is unknown."""
     if train_mean is None:
-        raise ValueError(
-            "the row train_mean needs the mean DoLP of a training split, got none; run `dvc repro synthesize`"
-        )
+        raise ValueError("row train_mean needs the mean DoLP of a training split, got none; run `dvc repro synthesize`")
     return Prediction(torch.full_like(truth, train_mean))
 
 
 def oracle_mean(truth: Frames, valid: Valid = None, train_mean: float | None = None) -> Prediction:
-    """Mean of each frame: the constant with the smallest squared error.
-
-    Only valid pixels count, as in the scores; a frame without valid pixels gets 0.
-    """
-    if valid is None:
-        mean = truth.mean(dim=(-2, -1), keepdim=True)
-    else:
-        count = valid.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
-        mean = torch.where(valid, truth, 0.0).sum(dim=(-2, -1), keepdim=True) / count
-    return Prediction(mean.expand_as(truth).contiguous())
+    """Mean over the valid pixels of each frame, the constant with the smallest squared error; 0 if there are none."""
+    mean = mean_where(truth, valid).nan_to_num(0.0)
+    return Prediction(mean[..., None, None].expand_as(truth).contiguous())
 
 
 REFERENCES = {
     row.name: row
     for row in (
         Reference("zeros", "zeros", "A constant: no polarization anywhere.", zeros),
-        Reference(
-            "train_mean",
-            "training mean",
-            "A constant: the mean DoLP of the training split.",
-            constant,
-            needs_train_mean=True,
-        ),
+        Reference("train_mean", "training mean", "A constant: the mean DoLP of the training split.", constant, True),
         Reference(
             "oracle_mean",
             "oracle mean",

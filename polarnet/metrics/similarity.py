@@ -49,10 +49,7 @@ def mean_where(values: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | 
 def with_truth_outside(
     predicted: Float[Tensor, "*b h w"], truth: Float[Tensor, "*b h w"], valid: Bool[Tensor, "*b h w"] | None
 ) -> Float[Tensor, "*b h w"]:
-    """`predicted` at valid pixels and `truth` at the others, so that those add no error.
-
-    Used by the measures over neighbourhoods: SSIM, and LPIPS, whose average includes the invalid pixels.
-    """
+    """`predicted` at valid pixels and `truth` at the others, which add no error to SSIM and LPIPS."""
     return predicted if valid is None else torch.where(valid, predicted, truth)
 
 
@@ -122,20 +119,16 @@ def gradient_agreement(
     """Agreement of edges in place, direction and height: 2 sum(grad a . grad b) / sum(|grad a|^2 + |grad b|^2).
 
     The range is [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for opposite gradients. An edge of
-    half the true height lowers the score, unlike in `correlation`. The gradients are Sobel's (smoothed central
-    differences) at the interior pixels. With a mask, they are taken at pixels whose eight neighbours are valid as well;
-    the score is 0 if there are none.
-
-    The ratio is that of gradient similarity (Liu, Lin & Narwaria, IEEE TIP 2012), but of vectors instead of magnitudes.
-    It is pooled over the frame before the division, so it needs no constant.
-
-    ValueError for a frame smaller than 3 pixels.
+    half the true height lowers the score, unlike in `correlation`. The gradients are Sobel's at the interior pixels
+    (with a mask: those whose eight neighbours are valid as well). The ratio is that of gradient similarity (Liu, Lin &
+    Narwaria, IEEE TIP 2012), but of vectors, and pooled over the frame before the division. ValueError for a frame
+    smaller than 3 pixels.
     """
     (a, b), valid = _checked(valid, a=a, b=b)
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
         raise ValueError(f"gradients need frames of at least 3 pixels a side, got {tuple(a.shape[-2:])}")
     dtype = torch.promote_types(a.dtype, b.dtype)
-    interior = None if valid is None else _eroded(valid)
+    interior = None if valid is None else valid.unfold(-2, 3, 1).unfold(-2, 3, 1).flatten(-2).all(-1)
     (a_x, a_y), (b_x, b_y) = (_sobel(x.double()) for x in (a, b))
 
     def total(values: Tensor) -> Tensor:
@@ -168,11 +161,9 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
     """Structural similarity (Wang et al. 2004) for the data range 1, with a Gaussian kernel of 11 pixels and sigma 1.5.
 
     The mean covers the whole frame, which is mirrored at its borders (the edge pixel is not repeated), as in
-    torchmetrics' `structural_similarity_index_measure`. scikit-image averages the interior alone, where both agree.
-
-    With a mask, the mean covers the valid pixels. Kernels that reach invalid pixels use the truth `b` for `a` there.
-    Computed in float32 at least, even under autocast: variances are small differences of large means. ValueError for a
-    frame smaller than 6 pixels.
+    torchmetrics' `structural_similarity_index_measure`; with a mask, it covers the valid pixels, and kernels that reach
+    invalid pixels use the truth `b` for `a` there. Computed in float32 at least, even under autocast: variances are
+    small differences of large means. ValueError for a frame smaller than 6 pixels.
 
     >>> import torch
     >>> from polarnet.metrics import ssim
@@ -222,21 +213,14 @@ def _deviation(centred: Tensor, valid: Tensor | None) -> Tensor:
 def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Float[Tensor, "*b i j"]]:
     """Gradients (along rows, along columns) per pixel, at the interior pixels."""
 
-    def filtered(x: Tensor, dim: int, taps: tuple[float, ...]) -> Tensor:
-        n = x.shape[dim] - len(taps) + 1
-        return torch.stack([tap * x.narrow(dim, k, n) for k, tap in enumerate(taps) if tap]).sum(dim=0)
+    def gradient(along: int, across: int) -> Tensor:
+        x = frames
+        for dim, taps in ((along, SOBEL_SLOPE), (across, SOBEL_SMOOTH)):
+            n = x.shape[dim] - len(taps) + 1
+            x = torch.stack([tap * x.narrow(dim, k, n) for k, tap in enumerate(taps) if tap]).sum(dim=0)
+        return x
 
-    return (
-        filtered(filtered(frames, -1, SOBEL_SLOPE), -2, SOBEL_SMOOTH),
-        filtered(filtered(frames, -2, SOBEL_SLOPE), -1, SOBEL_SMOOTH),
-    )
-
-
-def _eroded(valid: Bool[Tensor, "*b h w"]) -> Bool[Tensor, "*b i j"]:
-    """Interior pixels that are valid and have eight valid neighbours."""
-    height, width = valid.shape[-2] - 2, valid.shape[-1] - 2
-    shifts = [valid[..., i : i + height, j : j + width] for i in range(3) for j in range(3)]
-    return torch.stack(shifts).all(dim=0)
+    return gradient(-1, -2), gradient(-2, -1)
 
 
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:

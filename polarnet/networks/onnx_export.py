@@ -3,14 +3,13 @@
 The metadata of the file describes its inputs and outputs as JSON, so ONNX Runtime can run it without polarnet.
 """
 
-import contextlib
 import importlib.util
 import inspect
 import json
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +66,14 @@ def export_network(
     `path` cannot be written, and RuntimeError if packages are missing or the check fails. After an error an existing
     file is unchanged and no new file is left.
     """
-    _check_packages()
+    for name in ("onnx", "onnxruntime", "onnxscript"):
+        if importlib.util.find_spec(name) is None:
+            raise RuntimeError(f"ONNX files need {name}: {installation('export')}")
     path = Path(path)
-    _check_path(path)
+    if path.suffix != ".onnx" or path.is_dir():
+        raise ValueError(f"expected a file NAME.onnx to write, got {path}")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is no folder; make it first, or write {path.name} somewhere else")
     if min(height, width) < 1:
         raise ValueError(f"expected a height and a width of at least 1 pixel, got {height}x{width}")
     windows = random_windows(metadata["in_channels"], height, width)
@@ -118,18 +122,39 @@ def random_windows(channels: int, height: int, width: int) -> Float[Tensor, "t 1
 def _traced(
     network: nn.Module, metadata: Mapping[str, Any], events: Float[Tensor, "1 c h w"]
 ) -> tuple[Any, dict[str, Any]]:
-    """ONNX program of a network, and its description."""
+    """ONNX program of a network, and the description of inputs, outputs and state for users without polarnet."""
     with torch.no_grad():
         # Run the network at this size before tracing: it caches masks, and masks cached during tracing hold no values.
         prediction, state = network(events)
-    shapes = [list(tensor.shape) for tensor in state]
-    description = _description(metadata, prediction, list(events.shape), shapes)
-    with _quiet():
+    encode = REPRESENTATIONS[metadata["representation"]]
+    description = {
+        "format": FORMAT,
+        "network": metadata["network"],
+        "representation": metadata["representation"],
+        "window_us": trained_window_us(metadata),
+        "events": {
+            "shape": list(events.shape),
+            "polarizers_deg": POLARIZER_ANGLES_DEG,
+            "images_of_each": channels_of(encode),
+            "channel": "images_of_each * polarizer + image",
+            "images": inspect.getdoc(encode),
+        },
+        "outputs": {name: MEANINGS[name] for name in outputs_by_name(prediction, [])},
+        "state": [
+            {"input": f"state_{number}", "output": f"new_state_{number}", "shape": list(tensor.shape), "start": 0.0}
+            for number, tensor in enumerate(state)
+        ],
+        "checkpoint": dict(metadata),
+    }
+    # torch warns about missing torchvision, which polarnet does not use, and about deprecated names of its own
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
         program = torch.onnx.export(
             OneWindow(network).eval(),
-            (events, *(torch.zeros(shape) for shape in shapes)),
+            (events, *(torch.zeros_like(tensor) for tensor in state)),
             dynamo=True,
-            input_names=["events", *(entry["input"] for entry in description["state"])],
+            input_names=["events", *(f"state_{number}" for number in range(len(state)))],
             output_names=list(outputs_by_name(prediction, state)),
             opset_version=OPSET,
             verbose=False,
@@ -147,59 +172,3 @@ def _file_content(program: Any, description: Mapping[str, Any]) -> bytes:
         part.ClearField("metadata_props")
     onnx.helper.set_model_props(model, {KEY: json.dumps(description)})
     return model.SerializeToString(deterministic=True)
-
-
-def _description(
-    metadata: Mapping[str, Any], prediction: Prediction, shape: list[int], states: list[list[int]]
-) -> dict[str, Any]:
-    """Description of inputs, outputs and state, stored in the file for users without polarnet."""
-    encode = REPRESENTATIONS[metadata["representation"]]
-    return {
-        "format": FORMAT,
-        "network": metadata["network"],
-        "representation": metadata["representation"],
-        "window_us": trained_window_us(metadata),
-        "events": {
-            "shape": shape,
-            "polarizers_deg": POLARIZER_ANGLES_DEG,
-            "images_of_each": channels_of(encode),
-            "channel": "images_of_each * polarizer + image",
-            "images": inspect.getdoc(encode),
-        },
-        "outputs": {name: MEANINGS[name] for name in outputs_by_name(prediction, [])},
-        "state": [
-            {"input": f"state_{number}", "output": f"new_state_{number}", "shape": shape, "start": 0.0}
-            for number, shape in enumerate(states)
-        ],
-        "checkpoint": dict(metadata),
-    }
-
-
-def _check_path(path: Path) -> None:
-    if path.suffix != ".onnx":
-        raise ValueError(f"expected a file NAME.onnx to write, got {path}")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent} is no folder; make it first, or write {path.name} somewhere else")
-    if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise ValueError(f"{path} cannot be written: it is a folder, or {path.parent} is read-only for you")
-
-
-def _check_packages() -> None:
-    """RuntimeError if a package of the extra `export` is missing."""
-    for name in ("onnx", "onnxruntime", "onnxscript"):
-        if importlib.util.find_spec(name) is None:
-            raise RuntimeError(f"ONNX files need {name}: {installation('export')}")
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence torch's warnings about missing torchvision, which polarnet does not use, and about deprecated names."""
-    logger = logging.getLogger("torch.onnx._internal.exporter._registration")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            yield
-    finally:
-        logger.setLevel(before)

@@ -26,7 +26,7 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.panels import Panel, read_panel
 from polarnet.storage.scenes import SceneStore
-from polarnet.training.engine.history import best_row, read_history
+from polarnet.training.engine.recorder import best_row, read_history
 
 SIMULATED = "simulated"  # name of the pipeline's own test set
 OURS = "ours"  # folder of the DoLP network's training

@@ -13,7 +13,7 @@ CAPACITY = 8  # sequences in memory, about 25 MB each at 120x180 px and 2 millio
 
 
 class EmulatedEvents:
-    """An `EventSource` that emulates in memory the same events that `emulate_scenes` would store.
+    """A source of events that emulates in memory the same events that `emulate_scenes` would store.
 
     Sequences are emulated as a whole, because the pixels have memory. The last `capacity` sequences stay in memory for
     further reads. A copy in another process starts with none.

@@ -24,11 +24,8 @@ def dolp_task(
 ) -> Task:
     """Build the task that trains a network `name` (a key of section `networks`), from the seed or from `config.start`.
 
-    The expected errors of `config.start` are left out, because they fit the errors of that network.
-
-    The truth is a stack of DoLP, s1 and s2. The prediction is the same stack, or DoLP alone if the network predicts
-    nothing else. ValueError if the checkpoint holds another network, FileNotFoundError if there is
-    none.
+    The expected errors of `config.start` are left out. The truth is a stack of DoLP, s1 and s2; the prediction is the
+    same stack, or DoLP alone. ValueError if the checkpoint holds another network, FileNotFoundError if there is none.
     """
     build = network_config.network_class
     representation = config.representation or build.representation

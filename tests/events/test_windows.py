@@ -11,7 +11,7 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.events.windows import cut_windows, encode_windows, windows_of
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
-from polarnet.training.engine.windows import WindowDataset
+from polarnet.training.engine.sequences import WindowDataset
 
 HEIGHT, WIDTH = 4, 6
 T_US = torch.tensor([0, 33_333, 66_667, 100_000])

@@ -4,36 +4,20 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import (
-    ConvGRU,
-    Level,
-    ResidualBlock,
-    UpBlock,
-    conv3x3,
-    on_blocks,
-)
-
-
-def only_centres(gru: ConvGRU, from_input: list[float], from_state: list[float], from_reset_state: float) -> None:
-    """Make a one-channel GRU act on each pixel alone: every 3x3 kernel is zero but for its centre."""
-    with torch.no_grad():
-        for convolution, centres in (
-            (gru.from_input, from_input),
-            (gru.from_state, from_state),
-            (gru.from_reset_state, [from_reset_state]),
-        ):
-            convolution.weight.zero_()
-            convolution.weight[:, 0, 1, 1] = torch.tensor(centres)
-        gru.from_input.bias.zero_()
+from polarnet.networks.base.blocks import ConvGRU, Level, ResidualBlock, conv3x3, on_blocks
 
 
 def sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
 
 
+@torch.no_grad()
 def test_a_conv_gru_of_one_pixel_is_the_textbook_gru():
     gru = ConvGRU(1)
-    only_centres(gru, from_input=[0.5, -1.0, 2.0], from_state=[1.0, 0.25], from_reset_state=-0.5)
+    gru.from_input.bias.zero_()
+    centres = {gru.from_input: [0.5, -1.0, 2.0], gru.from_state: [1.0, 0.25], gru.from_reset_state: [-0.5]}
+    for convolution, values in centres.items():
+        convolution.weight[:, 0, 1, 1] = torch.tensor(values)  # one pixel meets no other weight of a kernel
     x, state = 0.8, 0.4
     reset = sigmoid(0.5 * x + 1.0 * state)
     update = sigmoid(-1.0 * x + 0.25 * state)
@@ -91,11 +75,3 @@ def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
     torch.manual_seed(0)
     layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)
     torch.testing.assert_close(on_blocks(layer, image), layer(F.pixel_unshuffle(image, 2)))
-
-
-def test_a_residual_block_has_two_3x3_convolutions_with_biases():
-    assert sum(p.numel() for p in ResidualBlock(128).parameters()) == 2 * (128 * 128 * 9 + 128)
-
-
-def test_an_up_block_doubles_the_size_and_takes_the_channels_of_its_skip():
-    assert UpBlock(8, 4)(torch.randn(3, 8, 5, 6), skip=torch.randn(3, 4, 10, 12)).shape == (3, 4, 10, 12)

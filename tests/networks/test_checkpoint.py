@@ -53,15 +53,18 @@ def test_another_file_under_a_checkpoints_name_is_refused(saved):
         load_network(path)
 
 
-def test_any_json_is_not_a_checkpoints_json(saved):
+TEXTS = [
+    ("[1, 2]", "expected a polarnet-checkpoint-2"),
+    *((text, "is not JSON") for text in ("{", "[" * 10**5, "9" * 5000)),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), TEXTS, ids=["list", "cut", "deep", "long"])
+def test_any_json_is_not_a_checkpoints_json(saved, text, message):
     path, _ = saved
-    path.with_suffix(".json").write_text("[1, 2]")
-    with pytest.raises(ValueError, match="expected a polarnet-checkpoint-2"):
+    path.with_suffix(".json").write_text(text)
+    with pytest.raises(ValueError, match=message):
         load_network(path)
-    for text in ("{", "[" * 100_000, "9" * 5000):
-        path.with_suffix(".json").write_text(text)
-        with pytest.raises(ValueError, match="is not JSON"):
-            load_network(path)
 
 
 def test_every_digit_of_the_json_is_covered_by_its_hash(saved):
@@ -90,25 +93,24 @@ def test_a_seal_beside_a_checkpoint_must_vouch_for_both_files(saved):
     load_checkpoint(saved[0])
 
 
-def test_a_checkpoint_of_another_kind_of_network_is_refused(saved):
+OTHER_CONFIG = {key: value for key, value in asdict(CONFIG).items() if key != "swin_depth"} | {"layers": 3}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"network": "firenet"}, "holds a 'firenet'; expected a DoLP network, one of paper"),
+        (
+            {"config": OTHER_CONFIG},
+            r"(?s)another version of networks\.paper: .*(layers.*swin_depth|swin_depth.*layers)",
+        ),
+        ({"in_channels": 4}, r"c1\.weight should be \(4, 4, 3, 3\), is \(4, 8, 3, 3\) \(1 tensors"),
+    ],
+)
+def test_a_checkpoint_of_another_network_is_refused_with_what_differs(saved, changes, message):
     path, _ = saved
-    rewrite(path, network="firenet")
-    with pytest.raises(ValueError, match="holds a 'firenet'; expected a DoLP network, one of paper"):
-        load_network(path)
-
-
-def test_a_config_of_another_version_says_which_keys_differ(saved):
-    path, _ = saved
-    config = {key: value for key, value in asdict(CONFIG).items() if key != "swin_depth"}
-    rewrite(path, config=config | {"layers": 3})
-    with pytest.raises(ValueError, match=r"networks\.paper .* lacks swin_depth and has besides layers"):
-        load_network(path)
-
-
-def test_tensors_of_another_shape_are_named(saved):
-    path, _ = saved
-    rewrite(path, in_channels=4)
-    with pytest.raises(ValueError, match=r"c1\.weight should be \(4, 4, 3, 3\), is \(4, 8, 3, 3\) \(1 tensors"):
+    rewrite(path, **changes)
+    with pytest.raises(ValueError, match=message):
         load_network(path)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jaxtyping
-import numpy as np
 import onnxruntime
 import pytest
 import torch
@@ -107,35 +106,6 @@ def never_traced(monkeypatch):
     monkeypatch.setattr(onnx_export, "_traced", lambda *_: pytest.fail("traced"))
 
 
-@torch.no_grad()
-def test_onnx_runtime_gives_what_torch_gives_window_after_window(written):
-    path, checkpoint, _ = written
-    network, metadata = load_network(checkpoint)
-    session = onnxruntime.InferenceSession(path)
-    names = [output.name for output in session.get_outputs()]
-    fed = {one.name: np.zeros(one.shape, np.float32) for one in session.get_inputs() if one.name != "events"}
-    state = None
-    for events in random_windows(metadata["in_channels"], HEIGHT, WIDTH):
-        given = dict(zip(names, session.run(names, {"events": events.numpy(), **fed}), strict=True))
-        fed = {name: given[f"new_{name}"] for name in fed}
-        prediction, state = network(events, state)
-        wanted = {name: field for name, field in prediction._asdict().items() if field is not None}
-        assert names == [*wanted, *(f"new_state_{number}" for number in range(len(state)))]
-        expected = wanted | dict(zip(names[len(wanted) :], state, strict=True))
-        for name in expected.keys() - {"aolp"}:  # which is none where (s1, s2) is zero
-            torch.testing.assert_close(torch.from_numpy(given[name]), expected[name], atol=1e-4, rtol=1e-4)
-        if "aolp" in wanted:
-            s1, s2 = given["stokes"][:, 0], given["stokes"][:, 1]
-            length = np.hypot(s1, s2)
-            np.testing.assert_allclose(length * np.cos(2 * given["aolp"]), s1, atol=1e-5)
-            np.testing.assert_allclose(length * np.sin(2 * given["aolp"]), s2, atol=1e-5)
-
-
-def test_the_command_reports_the_check(written):
-    equal = "ONNX Runtime's outputs equal torch's within 0.0001"
-    assert re.search(rf"polarnet\.onnx, 0\.\d MB; {equal}\n", written.printed)
-
-
 def program_in(path: Path) -> Callable[..., list[torch.Tensor]]:
     """The function in a file: events and state in, outputs in their order out."""
     session = onnxruntime.InferenceSession(path)
@@ -148,9 +118,12 @@ def program_in(path: Path) -> Callable[..., list[torch.Tensor]]:
     return run
 
 
-def test_the_check_detects_one_weight_that_is_off(written):
+def test_onnx_runtime_gives_what_torch_gives_window_after_window_and_one_weight_that_is_off_is_detected(written):
+    equal = "ONNX Runtime's outputs equal torch's within 0.0001"
+    assert re.search(rf"polarnet\.onnx, 0\.\d MB; {equal}\n", written.printed)
     network, metadata = load_network(written.checkpoint)
     windows = random_windows(metadata["in_channels"], HEIGHT, WIDTH)
+    assert windows[:-1].any()
     check_program(program_in(written.path), network, windows)
     last = network.p1 if hasattr(network, "p1") else network.add
     with torch.no_grad():
@@ -159,7 +132,7 @@ def test_the_check_detects_one_weight_that_is_off(written):
         check_program(program_in(written.path), network, windows)
 
 
-def test_the_file_says_what_it_takes(written):
+def test_the_file_says_what_it_takes_and_nothing_of_its_machine(written):
     path, checkpoint, _ = written
     session = onnxruntime.InferenceSession(path)
     about = json.loads(session.get_modelmeta().custom_metadata_map["polarnet"])
@@ -172,12 +145,8 @@ def test_the_file_says_what_it_takes(written):
     assert shapes == {one.name: one.shape for one in session.get_inputs()}
     assert shapes["events"] == [1, metadata["in_channels"], HEIGHT, WIDTH]
     assert [*about["outputs"], *(one["output"] for one in about["state"])] == [o.name for o in session.get_outputs()]
-
-
-def test_the_file_is_alone_and_tells_nothing_of_the_machine_that_wrote_it(written):
-    files = {written.path, written.checkpoint, written.checkpoint.with_suffix(".json")}
-    assert set(written.path.parent.iterdir()) == files
-    assert b".py" not in written.path.read_bytes()
+    assert set(path.parent.iterdir()) == {path, checkpoint, checkpoint.with_suffix(".json")}
+    assert b".py" not in path.read_bytes()  # nothing of the machine that wrote it
 
 
 @pytest.mark.parametrize("difference", [0.1, float("nan")])
@@ -206,22 +175,18 @@ def refusal(capsys, *arguments: object) -> str:
 
 
 @pytest.mark.usefixtures("never_traced")
-def test_what_cannot_be_written_is_refused_before_the_work(small, tmp_path, monkeypatch, capsys):
-    weights = ("--weights", small)
-    assert "expected a file NAME.onnx to write, got" in refusal(capsys, tmp_path / "n.pt", *weights)
-    assert "no folder; make it first" in refusal(capsys, tmp_path / "none" / "n.onnx", *weights)
-    (tmp_path / "folder.onnx").mkdir()
-    assert "cannot be written: it is a folder" in refusal(capsys, tmp_path / "folder.onnx", *weights)
-    monkeypatch.setattr(onnx_export.os, "access", lambda *_: False)  # tests may run as root, who can write anywhere
-    assert "is read-only for you" in refusal(capsys, tmp_path / "n.onnx", *weights)
-
-
-@pytest.mark.usefixtures("never_traced")
-def test_weights_and_sizes_that_are_none_are_refused(small, tmp_path, capsys):
-    out = tmp_path / "n.onnx"
-    assert "none.safetensors is missing" in refusal(capsys, out, "--weights", tmp_path / "none.safetensors")
-    assert "NAME.safetensors, got" in refusal(capsys, out, "--weights", tmp_path / "best.pth")
-    assert "at least 1 pixel, got 0x180" in refusal(capsys, out, "--weights", small, "--height", 0)
+@pytest.mark.parametrize(
+    ("out", "arguments", "message"),
+    [
+        ("n.pt", [], "expected a file NAME.onnx to write, got"),
+        ("none/n.onnx", [], "no folder; make it first"),
+        ("n.onnx", ["--height", 0], "at least 1 pixel, got 0x180"),
+        ("n.onnx", ["--weights", "none.safetensors"], "none.safetensors is missing"),
+        ("n.onnx", ["--weights", "best.pth"], "NAME.safetensors, got"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(small, tmp_path, capsys, out, arguments, message):
+    assert message in refusal(capsys, tmp_path / out, "--weights", small, *arguments)
 
 
 @pytest.mark.usefixtures("never_traced")

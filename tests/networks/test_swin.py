@@ -2,8 +2,6 @@ import pytest
 import torch
 
 from polarnet.networks.paper.swin import (
-    PatchMerging,
-    SwinBlock,
     WindowAttention,
     attend,
     join_windows,
@@ -69,16 +67,3 @@ def test_attention_of_equal_pixels_is_their_value():
     value = torch.tensor([2.0, -1.0]).expand(1, 1, 1, 9, 2).contiguous()
     attended = attend(torch.zeros_like(value), torch.zeros_like(value), value, torch.zeros(1, 9, 9), None)
     torch.testing.assert_close(attended, value)
-
-
-def test_patch_merging_halves_an_even_size():
-    assert PatchMerging(4, 8)(torch.randn(2, 4, 6, 10)).shape == (2, 3, 5, 8)
-
-
-def test_a_swin_block_has_the_parameters_that_its_paper_counts():
-    channels, heads, window = 64, 2, 5
-    norms = 2 * 2 * channels
-    attention = 4 * channels**2 + 4 * channels + heads * (2 * window - 1) ** 2
-    perceptron = 8 * channels**2 + 5 * channels
-    block = SwinBlock(channels, heads, window, shift=2)
-    assert sum(p.numel() for p in block.parameters()) == norms + attention + perceptron

@@ -20,7 +20,7 @@ from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import Prediction
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.engine.history import write_history
+from polarnet.training.engine.recorder import write_history
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}
 HISTORY = [

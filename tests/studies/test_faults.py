@@ -13,7 +13,7 @@ from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
 from polarnet.runtime.files import SUMS, seal
 from polarnet.storage.events import EventStore
-from polarnet.training.engine.history import write_history
+from polarnet.training.engine.recorder import write_history
 from studies import faults
 
 FAULTS = 90

@@ -16,8 +16,8 @@ from preloaded import FORKSERVER
 from test_loop import CPU, TRAIN, run, small_task
 
 from polarnet.networks.base.checkpoint import load_checkpoint
-from polarnet.training.engine.history import read_history
 from polarnet.training.engine.parallel import add_up, join, launched, place
+from polarnet.training.engine.recorder import read_history
 from polarnet.training.engine.sequences import Batch, parts_of
 
 ASLEEP = """

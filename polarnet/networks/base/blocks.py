@@ -15,9 +15,8 @@ from torch.nn import functional as F
 def contrasts(events: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
     """Return (e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135 and (e0 + e90) - (e45 + e135) of the four channels.
 
-    Unpolarized light drives all four channels equally, and this common part is far larger than the differences due to
-    polarization. With unmixed channels, a network would first have to learn the differences. The last contrast is not
-    redundant: events measure log intensities, and I0 + I90 = I45 + I135 does not hold for logarithms.
+    The common part of the channels is far larger than the differences due to polarization, which a network would first
+    have to learn. The last contrast is not redundant: I0 + I90 = I45 + I135 does not hold for logarithms.
     """
     e0, e45, e90, e135 = events.unflatten(-3, (4, -1)).unbind(-4)
     return torch.cat([(e0 + e45 + e90 + e135) / 2, e0 - e90, e45 - e135, (e0 + e90) - (e45 + e135)], dim=-3)
@@ -49,7 +48,7 @@ class ConvGRU(nn.Module):
     """Convolutional gated recurrent unit (Ballas et al., ICLR 2016) with 3x3 convolutions.
 
     reset, update = sigmoid(W x + U h);  candidate = tanh(W x + U (reset * h));  h <- h + update * (candidate - h).
-    The three W form one convolution over all windows at once. Only the U run window by window.
+    The W are one convolution over all windows at once; the U run window by window.
     """
 
     def __init__(self, channels: int):

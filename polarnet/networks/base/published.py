@@ -1,4 +1,4 @@
-"""Base class of recurrent networks with published weights: runs windows in order and loads the authors' files."""
+"""Base class of recurrent networks that others published, and the layers of FireNet, which E2P shares."""
 
 import os
 import pickle
@@ -10,33 +10,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 Network = TypeVar("Network", bound="PublishedNetwork")
-
-
-class StandIn:
-    """Empty replacement for an object of the authors' code in a file of which only the tensors are needed."""
-
-    def __init__(self, *arguments: Any):
-        pass
-
-    def __setstate__(self, state: Any) -> None:
-        pass
-
-
-def read_content(path: str | os.PathLike[str]) -> Any:
-    """Load a torch file without running code from it; objects of classes that are not torch's become `StandIn`.
-
-    ValueError if torch cannot read the file.
-    """
-    try:
-        unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
-    except (ValueError, RuntimeError):  # files older than torch's zip format, which hold no such objects
-        unknown = []
-    inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
-    try:
-        with torch.serialization.safe_globals(inert):
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-        raise ValueError(f"{path} is not a file of weights that torch can read: {str(error)[:200]}") from None
 
 
 class PublishedNetwork(nn.Module):
@@ -58,7 +31,7 @@ class PublishedNetwork(nn.Module):
 
     def unroll(
         self, windows: Float[Tensor, "t b bins h w"], state: Any = None
-    ) -> tuple[Float[Tensor, "t b *k i j"], list[Tensor]]:
+    ) -> tuple[Float[Tensor, "t b *k i j"], Any]:
         """Process t windows of b streams, one window after the other; `state` is None at the start."""
         frames = []
         for window in windows:
@@ -70,7 +43,8 @@ class PublishedNetwork(nn.Module):
     def load(cls: type[Network], path: str | os.PathLike[str]) -> Network:
         """Load a published file without running code from it; ValueError if it belongs to another network."""
         content = read_content(path)
-        tensors = cls.own_names(cls.published_tensors(path, content if isinstance(content, dict) else {}))
+        content = content if isinstance(content, dict) else {}
+        tensors = cls.own_names(content.get("state_dict", content))
         first = tensors.get(cls.first_layer)
         if first is None:
             raise ValueError(f"{path} holds no {cls.label}: expected a tensor {cls.first_layer}")
@@ -87,11 +61,64 @@ class PublishedNetwork(nn.Module):
         return {}
 
     @classmethod
-    def published_tensors(cls, path: str | os.PathLike[str], content: Mapping[str, Any]) -> Mapping[str, Tensor]:
-        """Tensors in the content of a published file, by the authors' names."""
-        return content.get("state_dict", content)
-
-    @classmethod
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Tensors by the names of this class, which are the authors' unless a subclass renames them."""
         return dict(tensors)
+
+
+class StandIn:
+    """Empty replacement for an object of the authors' code in a file of which only the tensors are needed."""
+
+    def __init__(self, *arguments: Any):
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+def read_content(path: str | os.PathLike[str]) -> Any:
+    """Load a torch file, with `StandIn`s for objects of the authors' code; ValueError if torch cannot read it."""
+    try:
+        unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+    except (ValueError, RuntimeError):  # files older than torch's zip format, which hold no such objects
+        unknown = []
+    inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
+    try:
+        with torch.serialization.safe_globals(inert):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        raise ValueError(f"{path} is not a file of weights that torch can read: {str(error)[:200]}") from None
+
+
+class ConvGRU(nn.Module):
+    """FireNet's convolutional gated recurrent unit, under the authors' names.
+
+    reset, update = sigmoid(conv[x, h]);  candidate = tanh(conv[x, reset * h]);  h <- h + update * (candidate - h).
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.reset_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+        self.update_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+        self.out_gate = nn.Conv2d(2 * channels, channels, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b c h w"], state: Float[Tensor, "b c h w"] | None) -> Float[Tensor, "b c h w"]:
+        """Return the new state; a `state` of None (at the start) counts as zeros."""
+        state = torch.zeros_like(x) if state is None else state.to(x.dtype)
+        both = torch.cat([x, state], dim=1)
+        reset, update = self.reset_gate(both).sigmoid_(), self.update_gate(both).sigmoid_()
+        candidate = self.out_gate(torch.cat([x, reset * state], dim=1)).tanh_()
+        return torch.lerp(state, candidate, update)
+
+
+class ResidualBlock(nn.Module):
+    """FireNet's residual block relu(x + conv(relu(conv(x))))."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Return a tensor of the same shape."""
+        return self.conv2(self.conv1(x).relu_()).add_(x).relu_()

@@ -1,8 +1,6 @@
-"""CISTA-TC: intensity from events by unrolled sparse coding (Liu, Dragotti, ICASSP 2022).
+"""CISTA-TC: intensity from events by unrolled sparse coding (Liu, Dragotti, ICASSP 2022; file cista_tc.pth.tar)."""
 
-`CistaTc.load` reads the published file cista_tc.pth.tar.
-"""
-
+import functools
 from typing import NamedTuple
 
 import torch
@@ -11,11 +9,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.base.published import PublishedNetwork
-from polarnet.networks.e2v.e2vid import ConvLstm, reflected
+from polarnet.networks.e2v.e2vid import Recurrent, convolution, reflected
 
 CHANNELS = 64  # features at half resolution
 ATOMS = 128  # channels of the sparse code
 ITERATIONS = 5
+reflecting = functools.partial(convolution, size=3, padding_mode="reflect")
 
 
 class CistaState(NamedTuple):
@@ -41,26 +40,23 @@ class CistaTc(PublishedNetwork):
 
     def __init__(self, bins: int):
         super().__init__(bins)
-        self.We = Convolution(bins, CHANNELS // 2)
-        self.Wi = Convolution(1, CHANNELS // 2)
-        self.W0 = Convolution(CHANNELS, CHANNELS, stride=2)
-        self.P0 = Convolution(CHANNELS, ATOMS)
-        self.one_conv_for_prev = Convolution(ATOMS, 1)
-        self.one_conv_for_cur = Convolution(ATOMS, 1)
+        self.We = reflecting(bins, CHANNELS // 2)
+        self.Wi = reflecting(1, CHANNELS // 2)
+        self.W0 = reflecting(CHANNELS, CHANNELS, stride=2)
+        self.P0 = reflecting(CHANNELS, ATOMS)
+        self.one_conv_for_prev = reflecting(ATOMS, 1)
+        self.one_conv_for_cur = reflecting(ATOMS, 1)
         self.alpha = nn.ParameterList(torch.ones(1, ATOMS, 1, 1) for _ in range(ITERATIONS))
         block = Iteration()
         self.lista_blocks = nn.ModuleList(block for _ in range(ITERATIONS))
-        self.Dg = Decoder()
-        self.upsamp_conv = Convolution(CHANNELS, CHANNELS)
-        self.final_conv = Convolution(CHANNELS, 1)
+        self.Dg = Recurrent(reflecting(ATOMS, CHANNELS, relu=True), CHANNELS, "reflect")
+        self.upsamp_conv = reflecting(CHANNELS, CHANNELS)
+        self.final_conv = reflecting(CHANNELS, 1)
 
     def forward(
         self, voxels: Float[Tensor, "b bins h w"], state: CistaState | None = None
     ) -> tuple[Float[Tensor, "b h w"], CistaState]:
-        """Return the intensity in [0, 1] at the end of one window, and the next state; `state` is None at the start.
-
-        The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
-        """
+        """Return the intensity in [0, 1] at the end of one window, and the next state; `state` is None at the start."""
         self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         image = torch.zeros_like(padded[:, :1]) if state is None else state.image
@@ -71,23 +67,11 @@ class CistaTc(PublishedNetwork):
         for alpha, block in zip(self.alpha, self.lista_blocks, strict=True):
             weight = torch.sigmoid(attended * self.one_conv_for_cur(code))
             code = block(code, features, weight * alpha * (before - code))
-        decoded, memory = self.Dg(code, None if state is None else state.memory)
-        upsampled = F.interpolate(decoded, scale_factor=2, mode="bilinear", align_corners=False)
+        memory = self.Dg(code, None if state is None else state.memory)
+        upsampled = F.interpolate(memory[0], scale_factor=2, mode="bilinear", align_corners=False)
         image = torch.sigmoid(self.final_conv(self.upsamp_conv(upsampled)).float())
         height, width = voxels.shape[-2:]
         return image[:, 0, top : top + height, left : left + width], CistaState(image, code, memory)
-
-
-class Convolution(nn.Module):
-    """A 3x3 convolution with reflection padding."""
-
-    def __init__(self, inputs: int, outputs: int, stride: int = 1):
-        super().__init__()
-        self.conv2d = nn.Conv2d(inputs, outputs, 3, stride, padding=1, padding_mode="reflect")
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
-        """Return d channels, downsampled by the stride."""
-        return self.conv2d(x)
 
 
 class Iteration(nn.Module):
@@ -95,8 +79,8 @@ class Iteration(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.D = Convolution(ATOMS, CHANNELS)
-        self.P = Convolution(CHANNELS, ATOMS)
+        self.D = reflecting(ATOMS, CHANNELS)
+        self.P = reflecting(CHANNELS, ATOMS)
         self.Lambda = nn.Parameter(torch.full((1, ATOMS, 1, 1), 1e-3))
 
     def forward(
@@ -105,20 +89,3 @@ class Iteration(nn.Module):
         """Return the next code."""
         x = self.P(features - self.D(code)) + code + pull
         return F.relu(x - self.Lambda) - F.relu(-x - self.Lambda)  # trained values of Lambda can be negative
-
-
-class Decoder(nn.Module):
-    """Decoder from the code to features: convolution, ReLU, ConvLSTM."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = Convolution(ATOMS, CHANNELS)
-        self.recurrent_block = ConvLstm(CHANNELS)
-        self.recurrent_block.Gates = nn.Conv2d(2 * CHANNELS, 4 * CHANNELS, 3, padding=1, padding_mode="reflect")
-
-    def forward(
-        self, code: Float[Tensor, "b 128 h w"], state: tuple[Tensor, Tensor] | None
-    ) -> tuple[Float[Tensor, "b 64 h w"], tuple[Tensor, Tensor]]:
-        """Return the features and the state for the next window."""
-        state = self.recurrent_block(F.relu(self.conv(code)), state)
-        return state[0], state

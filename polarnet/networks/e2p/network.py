@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.firenet_layers import ConvGRU, ResidualBlock
-from polarnet.networks.base.published import PublishedNetwork
+from polarnet.networks.base.published import ConvGRU, PublishedNetwork, ResidualBlock
 from polarnet.stokes import aolp
 
 CHANNELS = 32
@@ -46,16 +45,18 @@ class E2p(PublishedNetwork):
     def forward(
         self, mosaic: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b maps h//2 w//2"], list[Tensor]]:
-        """Return intensity, AoLP and DoLP at the end of one window, and the next state; `state` is None at the start.
+        """Return unclamped intensity, AoLP and DoLP at the end of one window, and the next state, None at the start.
 
         The input is an unnormalised voxel grid. AoLP is coded as in `coded_aolp`, or takes two maps, the sine and
-        cosine of twice the angle. The outputs are not clamped.
+        cosine of twice the angle.
         """
-        if mosaic.shape[1] != self.bins or mosaic.shape[-1] % 2 or mosaic.shape[-2] % 2:
-            raise ValueError(f"this E2P takes {self.bins} bins of even height and width, got {tuple(mosaic.shape[1:])}")
-        if min(mosaic.shape[-2:]) < 2 * MIN_SIDE:
-            raise ValueError(f"E2P needs at least {2 * MIN_SIDE} rows and columns, got {tuple(mosaic.shape[-2:])}")
-        branches: list[Any] = [self.branches[name] for name in BRANCHES]
+        bins, height, width = mosaic.shape[1:]
+        if bins != self.bins or height % 2 or width % 2 or min(height, width) < 2 * MIN_SIDE:
+            raise ValueError(
+                f"this E2P takes {self.bins} bins of even height and width, at least {2 * MIN_SIDE}, "
+                f"got {tuple(mosaic.shape[1:])}"
+            )
+        branches: list[Any] = [*self.branches.values()]
         before: Sequence[Tensor | None] = state or [None] * (2 * len(branches))
         mosaic = mosaic.contiguous(memory_format=torch.channels_last)
         first = [branch.G1(branch.head(mosaic), h) for branch, h in zip(branches, before[: len(branches)], strict=True)]
@@ -93,11 +94,9 @@ class Branch(nn.Module):
         self.G1, self.G2 = ConvGRU(CHANNELS), ConvGRU(CHANNELS)
         self.R1, self.R2 = ResidualBlock(CHANNELS), ResidualBlock(CHANNELS)
         self.pred = nn.Conv2d(CHANNELS, maps, 3, padding=1)
-        for gru in (self.G1, self.G2):
-            for gate in (gru.reset_gate, gru.update_gate, gru.out_gate):
-                nn.init.orthogonal_(gate.weight)
-                assert gate.bias is not None
-                nn.init.zeros_(gate.bias)
+        for gate in (gate for gru in (self.G1, self.G2) for gate in gru.children()):
+            nn.init.orthogonal_(gate.get_parameter("weight"))
+            nn.init.zeros_(gate.get_parameter("bias"))
 
 
 class MosaicHead(nn.Module):

@@ -1,13 +1,13 @@
 """E2VID: intensity from events, with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
 
-This is the network of the published "lightweight" checkpoint. `E2vid.load` reads the file E2VID_lightweight.pth.tar.
+`E2vid.load` reads the authors' "lightweight" checkpoint, E2VID_lightweight.pth.tar.
 """
 
 import itertools
 import math
-import os
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -19,18 +19,8 @@ from polarnet.networks.base.published import PublishedNetwork
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
 RESIDUAL_BLOCKS = 2
+Padding = Literal["zeros", "reflect"]
 SIZE_MULTIPLE = 2 ** len(ENCODER_CHANNELS)  # each encoder halves height and width
-PUBLISHED_ARCH = "E2VIDRecurrent"
-PUBLISHED_PREFIX = "unetrecurrent."
-PUBLISHED_SETTINGS = {
-    "skip_type": "sum",
-    "recurrent_block_type": "convlstm",
-    "num_encoders": len(ENCODER_CHANNELS),
-    "base_num_channels": HEAD_CHANNELS,
-    "num_residual_blocks": RESIDUAL_BLOCKS,
-    "norm": "BN",
-    "use_upsample_conv": False,
-}
 
 
 class E2vid(PublishedNetwork):
@@ -47,19 +37,19 @@ class E2vid(PublishedNetwork):
         super().__init__(bins)
         sizes = (HEAD_CHANNELS, *ENCODER_CHANNELS)
         steps = list(itertools.pairwise(sizes))
-        self.head = Convolution(bins, HEAD_CHANNELS, 5, normalised=False)
-        self.encoders = nn.ModuleList(RecurrentEncoder(inputs, outputs) for inputs, outputs in steps)
+        self.head = convolution(bins, HEAD_CHANNELS, 5, relu=True)
+        self.encoders = nn.ModuleList(
+            Recurrent(convolution(inputs, outputs, 5, stride=2, normalised=True, relu=True), outputs)
+            for inputs, outputs in steps
+        )
         self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1]) for _ in range(RESIDUAL_BLOCKS))
-        self.decoders = nn.ModuleList(Decoder(inputs, outputs) for outputs, inputs in reversed(steps))
-        self.pred = Convolution(HEAD_CHANNELS, 1, 1, normalised=True, relu=False)
+        self.decoders = nn.ModuleList(decoder(inputs, outputs) for outputs, inputs in reversed(steps))
+        self.pred = convolution(HEAD_CHANNELS, 1, 1, normalised=True)
 
     def forward(
         self, voxels: Float[Tensor, "b bins h w"], state: Sequence[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
-        """Return the intensity at the end of one window, and the next state; `state` is None at the start.
-
-        The input is padded by reflection to multiples of 8, and the result is cropped to the original size.
-        """
+        """Return the intensity at the end of one window, and the next state; `state` is None at the start."""
         self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         head = self.head(padded.contiguous(memory_format=torch.channels_last))
@@ -70,60 +60,46 @@ class E2vid(PublishedNetwork):
             after += [x, memory]
         for block in self.resblocks:
             x = block(x)
-        for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
-            x = decoder(x + skip)
+        for decode, skip in zip(self.decoders, reversed(skips), strict=True):
+            x = decode(x + skip)
         intensity = torch.sigmoid(self.pred(x + head).float())
         height, width = voxels.shape[-2:]
         return intensity[:, 0, top : top + height, left : left + width], after
 
     @classmethod
-    def published_tensors(cls, path: str | os.PathLike[str], content: Mapping[str, Any]) -> Mapping[str, Tensor]:
-        """Check the network settings in the file as well, because several versions of E2VID share tensor names."""
-        if "state_dict" not in content:
-            raise ValueError(f"{path} holds no E2VID: expected a dictionary with arch, model and state_dict")
-        if content.get("arch", PUBLISHED_ARCH) != PUBLISHED_ARCH:
-            raise ValueError(f"{path} holds no E2VID: its arch is {content['arch']!r}, expected {PUBLISHED_ARCH!r}")
-        settings = content.get("model") or content.get("config", {}).get("model", {})
-        for key, expected in PUBLISHED_SETTINGS.items():
-            if key in settings and settings[key] != expected:
-                raise ValueError(
-                    f"{path} holds another E2VID: its {key} is {settings[key]!r}, expected {expected!r}; "
-                    f"the published file is E2VID_lightweight.pth.tar"
-                )
-        return content["state_dict"]
-
-    @classmethod
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Remove the authors' prefix."""
-        return {name.removeprefix(PUBLISHED_PREFIX): tensor for name, tensor in tensors.items()}
+        return {name.removeprefix("unetrecurrent."): tensor for name, tensor in tensors.items()}
 
 
-class Convolution(nn.Module):
-    """Convolution, optional batch normalisation (which replaces the bias), optional ReLU."""
+def convolution(
+    inputs: int, outputs: int, size: int, *, stride: int = 1, normalised: bool = False, relu: bool = False,
+    padding_mode: Padding = "zeros",
+) -> nn.Sequential:  # fmt: skip
+    """Build a convolution, with batch normalisation (which replaces the bias) and ReLU on request."""
+    layer = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=not normalised, padding_mode=padding_mode)
+    norm = nn.BatchNorm2d(outputs) if normalised else None
+    return named(conv2d=layer, norm_layer=norm, relu=nn.ReLU() if relu else None)
 
-    def __init__(
-        self, inputs: int, outputs: int, kernel_size: int, *, normalised: bool, stride: int = 1, relu: bool = True
-    ):
+
+def decoder(inputs: int, outputs: int) -> nn.Sequential:
+    """Build an upsampling by 2: transposed 5x5 convolution, batch normalisation, ReLU."""
+    layer = nn.ConvTranspose2d(inputs, outputs, 5, stride=2, padding=2, output_padding=1, bias=False)
+    return named(transposed_conv2d=layer, norm_layer=nn.BatchNorm2d(outputs), relu=nn.ReLU())
+
+
+def named(**layers: nn.Module | None) -> nn.Sequential:
+    """Build a sequence of the layers that are not None, with their published names."""
+    return nn.Sequential(OrderedDict((name, layer) for name, layer in layers.items() if layer is not None))
+
+
+class Recurrent(nn.Module):
+    """A convolution, then a ConvLSTM."""
+
+    def __init__(self, conv: nn.Module, channels: int, padding_mode: Padding = "zeros"):
         super().__init__()
-        self.conv2d = nn.Conv2d(inputs, outputs, kernel_size, stride, padding=kernel_size // 2, bias=not normalised)
-        self.norm_layer = nn.BatchNorm2d(outputs) if normalised else None
-        self.relu = relu
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d i j"]:
-        """Return d channels, downsampled by the stride."""
-        x = self.conv2d(x)
-        if self.norm_layer is not None:
-            x = self.norm_layer(x)
-        return F.relu(x) if self.relu else x
-
-
-class RecurrentEncoder(nn.Module):
-    """Downsampling by 2 with a 5x5 convolution, then a ConvLSTM."""
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.conv = Convolution(inputs, outputs, 5, normalised=True, stride=2)
-        self.recurrent_block = ConvLstm(outputs)
+        self.conv = conv
+        self.recurrent_block = ConvLstm(channels, padding_mode)
 
     def forward(
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
@@ -138,9 +114,9 @@ class ConvLstm(nn.Module):
     memory <- f memory + i g;  output <- o tanh(memory)
     """
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, padding_mode: Padding = "zeros"):
         super().__init__()
-        self.Gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1)
+        self.Gates = nn.Conv2d(2 * channels, 4 * channels, 3, padding=1, padding_mode=padding_mode)
 
     def forward(
         self, x: Float[Tensor, "b c h w"], state: tuple[Tensor, Tensor] | None
@@ -165,21 +141,6 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return a tensor of the same shape."""
         return F.relu(x + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
-
-
-class Decoder(nn.Module):
-    """Upsampling by 2 with a transposed 5x5 convolution."""
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.transposed_conv2d = nn.ConvTranspose2d(
-            inputs, outputs, 5, stride=2, padding=2, output_padding=1, bias=False
-        )
-        self.norm_layer = nn.BatchNorm2d(outputs)
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d 2*h 2*w"]:
-        """Return d channels at twice the height and width."""
-        return F.relu(self.norm_layer(self.transposed_conv2d(x)))
 
 
 def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:

@@ -50,10 +50,9 @@ class DolpUNetConfig:
 
 
 class DolpUNet(nn.Module):
-    """The paper's recurrent network from event tensors of four channels to DoLP, window by window.
+    """The paper's recurrent network from event tensors of four channels to DoLP.
 
-    The input of C1 is the four tensors, mixed according to `input_mixing`. The output is linear, so that
-    gradients do not vanish near 0 or 1. It can therefore leave [0, 1]; code that scores or displays it clamps it.
+    The output is linear, so that gradients do not vanish near 0 or 1; code that scores or displays it clamps it.
     """
 
     representation = "event_tensor"
@@ -95,15 +94,10 @@ class DolpUNet(nn.Module):
         state1, state2 = state or (None, None)
 
         c1 = F.relu(self.c1(x))
-        s1 = self.s1(c1)
-        g1, state1 = self.g1(s1, b, state1)
-        s2 = self.s2(g1)
-        g2, state2 = self.g2(s2, b, state2)
-        r = self.r(g2)
-        d2 = self.d2(r, skip=g1)
-        d1 = self.d1(d2, skip=c1)
-        dolp = self.p1(d1)
-
+        g1, state1 = self.g1(self.s1(c1), b, state1)
+        g2, state2 = self.g2(self.s2(g1), b, state2)
+        d2 = self.d2(self.r(g2), skip=g1)
+        dolp = self.p1(self.d1(d2, skip=c1))
         dolp = dolp[:, 0, :height, :width].float().unflatten(0, (t, b))
         return Prediction(dolp), [state1, state2]
 

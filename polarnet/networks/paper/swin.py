@@ -36,8 +36,6 @@ class WindowAttention(nn.Module):
 
     def __init__(self, channels: int, heads: int, window: int, shift: int):
         super().__init__()
-        if channels % heads:
-            raise ValueError(f"expected heads that divide {channels} channels, got {heads}")
         self.heads, self.window, self.shift = heads, window, shift
         self.qkv = nn.Linear(channels, 3 * channels)
         self.merge_heads = nn.Linear(channels, channels)
@@ -61,9 +59,8 @@ class SwinBlock(nn.Module):
         self.attention_norm = nn.LayerNorm(channels)
         self.attention = WindowAttention(channels, heads, window, shift)
         self.mlp_norm = nn.LayerNorm(channels)
-        self.mlp = nn.Sequential(
-            nn.Linear(channels, MLP_RATIO * channels), nn.GELU(), nn.Linear(MLP_RATIO * channels, channels)
-        )
+        hidden = MLP_RATIO * channels
+        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
 
     def forward(self, x: Float[Tensor, "n h w c"]) -> Float[Tensor, "n h w c"]:
         """Return a tensor of the same shape."""
@@ -143,15 +140,10 @@ def visible_pixels(
     height: int, width: int, window: int, shift: int, device: torch.device
 ) -> Bool[Tensor, "g 1 1 p"] | None:
     """Return the mask of pixels inside the image for every tile of `split_windows`; None if all are inside."""
-    rows, columns = _grid(height, width, window, shift)
-    if not shift and (rows * window, columns * window) == (height, width):
-        return None
     with torch.inference_mode(False):
-        row = torch.arange(rows * window) - shift
-        column = torch.arange(columns * window) - shift
-        inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
-        inside = inside.view(rows, window, columns, window).permute(0, 2, 1, 3)
-        return inside.reshape(rows * columns, 1, 1, window * window).to(device)
+        ones, _, _ = split_windows(torch.ones(1, height, width, 3), 1, window, shift)
+        inside = (ones[0].transpose(-1, -2) > 0).to(device)
+    return None if inside.all() else inside
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,10 +1,8 @@
-"""Expected error of DoLP, from a few features that also work on new scenes.
+"""Expected squared error of DoLP: the exponential of a quadratic function of four features.
 
-The features measure three things. The redundancy's candidates disagree where the scene is poorly known. DoLP is
-bounded, so middle values can have larger errors. Without events there is no evidence.
-
-The expected squared error is the exponential of a quadratic function of these features. Its few coefficients are fitted
-after training (`polarnet.training.engine.calibration`).
+The redundancy's candidates disagree where the scene is poorly known. DoLP is bounded, so middle values can have larger
+errors. Without events there is no evidence. A fit after training (`polarnet.training.engine.calibration`) gives the
+coefficients.
 """
 
 from itertools import combinations_with_replacement
@@ -28,11 +26,7 @@ LITTLE_EVIDENCE = 0.1  # mean evidence of a frame with a silence of 1/2
 
 
 class ExpectedError(nn.Module):
-    """Log-variance of DoLP's error at half resolution: weight @ features + bias.
-
-    Weight and bias are not trained by gradients. The network expects the error `UNFITTED` everywhere until
-    `polarnet.training.engine.loop.calibrate` sets them.
-    """
+    """Log-variance of DoLP's error at half resolution: weight @ features + bias, `UNFITTED` everywhere until fitted."""
 
     weight: Float[Tensor, " k"]
     bias: Float[Tensor, ""]
@@ -56,14 +50,9 @@ def error_features(
 ) -> Float[Tensor, "n k 2*h 2*w"]:
     """Compute features of the errors of `dolp` at half its resolution; the candidates are at quarter resolution.
 
-    The four basic features are:
-
-    - log of the weighted variance of the candidates' DoLP,
-    - mean of this feature over the frame,
-    - silence: lack of evidence in the frame, from 0 to 1,
-    - log of the room for errors, dolp * (1 - dolp).
-
-    Their squares and products follow.
+    The four basic features are the log of the weighted variance of the candidates' DoLP, its mean over the frame, the
+    lack of evidence in the frame (silence, from 0 to 1), and the log of the room for errors, dolp * (1 - dolp). Their
+    squares and products follow.
     """
     total = weights.sum(1, keepdim=True).clamp(min=MIN_WEIGHT)
     mean = (weights * candidates).sum(1, keepdim=True) / total

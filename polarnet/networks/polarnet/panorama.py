@@ -7,14 +7,11 @@ moves with the scene: after a displacement d, the point at p was at p + d, a fac
 An error of `own` stays at its pixel, whereas an error of `level` moves with the scene. Each image therefore reveals the
 errors of the other, wherever the scene varies along its motion.
 
-`follow` is the Kalman filter of the two images, one filter for each spatial frequency. The prior power of the scene
-falls with the square of the frequency. At the start both images are 0, with the same error. Such registration also
-removes the fixed pattern of infrared sensors (Hardie et al., Applied Optics 2000). Mosaicing with event cameras (Kim et
-al., BMVC 2014) filters pixel by pixel instead.
+`follow` is the Kalman filter of the two images, one for each spatial frequency. At the start both images are 0, with
+the same error. Such registration also removes the fixed pattern of infrared sensors (Hardie et al., Applied Optics
+2000). Mosaicing with event cameras (Kim et al., BMVC 2014) filters pixel by pixel instead.
 
-The motion is one displacement per window, at the best correlation between the events of two consecutive windows
-(`displacements`). Lengths are in pixels of the input images. Log intensities are in steps, where one step is the
-contrast threshold of an event.
+Lengths are in pixels of the input images; log intensities are in steps, the contrast threshold of an event.
 """
 
 import math
@@ -37,15 +34,13 @@ class Memory(NamedTuple):
     prior: float
     """Prior variance of the scene at a frequency of 1 radian per pixel; it falls with the square of the frequency."""
     noise: float
-    """Measurement noise: variance of a pixel's sum of events, independent in each window, for example from rounding to
-    whole steps."""
+    """Variance of a pixel's sum of events, independent in each window, for example from rounding to whole steps."""
     drift: float
     """Variance that each window adds to the error of a pixel's sum of events."""
     renewal: float
     """Loss of certainty, over the whole image, per fraction of the image that a displacement replaces."""
     fade: float
-    """Factor per window for parts of the panorama that are out of sight, and for the certainty without a reliable
-    motion."""
+    """Factor per window for parts of the panorama out of sight, and for the certainty without a reliable motion."""
 
 
 class Motion(NamedTuple):
@@ -81,15 +76,10 @@ def empty_panorama(like: Float[Tensor, "b c h w"], margin: int) -> Panorama:
     return Panorama(like.new_zeros(b, c, height, width), like.new_zeros(b, c, h, w), explained)
 
 
-def _round(size: int) -> int:
-    return -(-size // ROUND) * ROUND
-
-
 def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
-    """Find the displacements [t, b] that maximise the correlation between consecutive windows.
+    """Find the displacements [t, b], up to `reach` along each axis, of best correlation between consecutive windows.
 
-    The search covers `reach` pixels along each axis. A parabola through the maximum and its neighbours gives subpixel
-    precision.
+    A parabola through the maximum and its neighbours gives subpixel precision.
     """
     height, width = images.shape[-2:]
     images = images.clamp(-MAX_EVENTS, MAX_EVENTS)
@@ -112,6 +102,10 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     y = (best // side - reach) + _vertex(above, middle, below)
     energy = images.square().sum((-2, -1)).sqrt()
     return Motion(torch.stack([x, y], dim=-1), middle > MIN_CORRELATION * (energy[:-1] * energy[1:]).clamp(min=1e-6))
+
+
+def _round(size: int) -> int:
+    return -(-size // ROUND) * ROUND
 
 
 def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -151,13 +145,9 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama
     to_level = torch.fft.irfft2(spectrum * level_alone, s=size)
     to_own = torch.fft.irfft2(spectrum * own_alone.conj(), s=size)[..., :height, :width]
     of_both = of_both + level_alone * own_alone / spread
-    variances = [
-        of_level - level_alone.abs().square() / spread,
-        of_own - own_alone.abs().square() / spread,
-        of_both.real,
-        of_both.imag,
-    ]
-    explained = expected - torch.cat(variances, dim=1)
+    of_level = of_level - level_alone.abs().square() / spread
+    of_own = of_own - own_alone.abs().square() / spread
+    explained = expected - torch.cat([of_level, of_own, of_both.real, of_both.imag], dim=1)
 
     own_explained = memory.fade * panorama.explained[:, 1:2]
     still_explained = torch.cat([*[own_explained] * 3, torch.zeros_like(own_explained)], dim=1)
@@ -174,10 +164,7 @@ def certainty(panorama: Panorama, memory: Memory) -> Float[Tensor, "b 1 1 1"]:
 
 
 def _expected(size: tuple[int, int], memory: Memory, like: Tensor) -> Float[Tensor, "4 H F"]:
-    """Return the initial error variances and covariance of each frequency, which `Panorama.explained` is relative to.
-
-    At the start both images are 0, so both errors equal minus the scene.
-    """
+    """Return the error variances and covariance at the start, when both errors equal minus the scene."""
     down, across = _frequencies(size, like)
     lowest = (2 * math.pi / max(size)) ** 2
     variance = memory.prior / (down.square() + across.square()).clamp(min=lowest)

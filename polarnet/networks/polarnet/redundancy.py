@@ -9,9 +9,8 @@ For small changes,
 or C = -s1 A + s2 B: one linear equation per pixel, without S0 and without the unknown constants of the logarithms.
 Least squares over neighbours and past windows gives s1 and s2.
 
-The events measure e_k with noise, because thresholds differ between pixels and changes come in whole steps. This noise
-biases the second moments in the least-squares problem ("errors in variables"). `SecondMoments` subtracts the expected
-bias. The size of the bias and the weights of the pixels are trained.
+Thresholds differ between pixels and changes come in whole steps. This noise of the events biases the second moments in
+the least-squares problem ("errors in variables"); `SecondMoments` subtracts the expected bias, whose size is trained.
 
 The same equation holds for differences between neighbouring pixels, given an image of each log I_k: `SlopeMoments`.
 """
@@ -56,10 +55,8 @@ class SecondMoments(nn.Module):
         self.log_step = nn.Parameter(torch.full((memories,), -2.0))
 
     def forward(self, events: Float[Tensor, "n m 4 h w"], pooled: int) -> Float[Tensor, "n m 6 h/{pooled} w/{pooled}"]:
-        """Return the `MOMENTS` of the event sums of four channels, averaged over `pooled` x `pooled` pixels.
-
-        Linear operations follow the pooling, when the images are small, because memory traffic dominates the cost.
-        """
+        """Return the `MOMENTS` of the event sums of four channels, averaged over `pooled` x `pooled` pixels."""
+        # linear operations follow the pooling, when the images are small: memory traffic dominates the cost
         activity, mismatch, step = (
             p.exp().view(-1, 1, 1, 1) for p in (self.log_activity, self.log_mismatch, self.log_step)
         )
@@ -79,8 +76,7 @@ class SecondMoments(nn.Module):
 class SlopeMoments(nn.Module):
     """Products of the differences between neighbouring pixels in images of A, B and C.
 
-    The equation for changes in time also holds for differences in space. A trained number sets the decrease of a
-    pixel's weight with its energy, because the images have their largest errors at edges.
+    A trained number sets the decrease of a pixel's weight with its energy: the images' largest errors are at edges.
     """
 
     def __init__(self):
@@ -145,10 +141,8 @@ def neighbourhoods(x: Float[Tensor, "n c h w"], scales: Sequence[int]) -> Iterab
 
 
 def block_means(x: Float[Tensor, "*b h w"], size: int) -> Float[Tensor, "*b h/{size} w/{size}"]:
-    """Return means over blocks of `size` x `size` pixels; height and width must be multiples of `size`.
-
-    Whole rows are summed first, which is faster than avg_pool2d's pixel-by-pixel loop.
-    """
+    """Return means over blocks of `size` x `size` pixels; height and width must be multiples of `size`."""
+    # whole rows first, which is faster than avg_pool2d's pixel-by-pixel loop
     rows = x.unflatten(-2, (-1, size)).sum(-2)
     return rows.unflatten(-1, (-1, size)).sum(-1) / size**2
 
@@ -164,10 +158,10 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
         sums = x.float().contiguous(memory_format=torch.channels_last)
         sums = F.conv2d(sums, ones, padding=(0, width // 2), groups=channels)
         sums = F.conv2d(sums, ones.transpose(2, 3), padding=(width // 2, 0), groups=channels)
-    return sums / (inside(rows, width, x)[:, None] * inside(columns, width, x))
+    return sums / (_inside(rows, width, x)[:, None] * _inside(columns, width, x))
 
 
-def inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:
+def _inside(pixels: int, width: int, like: Tensor) -> Float[Tensor, " pixels"]:
     """For each pixel of a row, count how many of the `width` pixels around it lie inside the row."""
     middle = torch.arange(pixels, device=like.device)
     return ((middle + width // 2).clamp(max=pixels - 1) - (middle - width // 2).clamp(min=0) + 1).float()

@@ -9,41 +9,14 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import (
-    ConvGRU,
-    Level,
-    ResidualBlock,
-    UpBlock,
-    compressed,
-    contrasts,
-    conv3x3,
-    enlarged,
-    on_blocks,
-)
+from polarnet.networks.base import blocks
+from polarnet.networks.polarnet import panorama as panoramas
+from polarnet.networks.polarnet import redundancy, refinement
 from polarnet.networks.polarnet.expected_error import ExpectedError, error_features
-from polarnet.networks.polarnet.fine_structure import WIDE, averaged, differences, moved_by_events, wide_differences
-from polarnet.networks.polarnet.panorama import (
-    Memory,
-    Motion,
-    Panorama,
-    certainty,
-    displacements,
-    empty_panorama,
-    follow,
-)
-from polarnet.networks.polarnet.redundancy import (
-    MOMENTS,
-    LeastSquares,
-    SecondMoments,
-    SlopeMoments,
-    block_means,
-    faded,
-    length,
-    neighbourhoods,
-)
-from polarnet.networks.polarnet.sensitivity import Equaliser
-from polarnet.networks.polarnet.shot_noise import Counts, ShotNoise, isolated_events, moved_by_noise
-from polarnet.networks.polarnet.threshold import Scale, scale_features
+from polarnet.networks.polarnet.panorama import Memory, Motion, Panorama
+from polarnet.networks.polarnet.redundancy import block_means, length
+from polarnet.networks.polarnet.refinement import WIDE, Counts
+from polarnet.networks.polarnet.sensor import Equaliser, Scale, scale_features
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
@@ -51,11 +24,9 @@ STRIDE = 4  # stride of the finest recurrent layer; height and width (in blocks 
 IMAGES = 2  # input images per channel: sum of polarities and number of events (representation `event_counts`)
 PARTS = ("redundancy", "slopes", "shot_noise", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
-SENSITIVITY_TENSORS = 2  # numbers of ON and OFF events, and the change of their weights
-NOISE_TENSORS = 2  # isolated events and quiet pixels; how many pixels around each one fired in the last window
-PANORAMA_TENSORS = 1 + len(Panorama._fields)  # events of the previous window, then the panorama
+NOISE_TENSORS = SENSITIVITY_TENSORS = 2  # of the state, see `StokesUNet`
 NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
-SOLVER_TENSORS = SENSITIVITY_TENSORS + NOISE_TENSORS + len(NO_STATE) + PANORAMA_TENSORS  # recurrent layers' follow
+SOLVER_TENSORS = NOISE_TENSORS + SENSITIVITY_TENSORS + len(NO_STATE) + 1 + len(Panorama._fields)
 MAX_BINNING = 8
 Binning = Annotated[int, Field(ge=1, le=MAX_BINNING)]
 
@@ -86,24 +57,17 @@ class StokesUNetConfig:
     panorama_renewal: Annotated[float, Field(ge=0, le=1)]
     panorama_fade: Annotated[float, Field(ge=0, le=1)]
     panorama_step: PositiveFloat
-    """Change of natural-log intensity per event of a sensor with scale 1 (module `threshold`)."""
+    """Change of natural-log intensity per event of a sensor with scale 1 (`Scale`)."""
     panorama_scale: PositiveInt
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
     panorama_share: Annotated[float, Field(ge=0.01, le=0.99)]
     """Initial weight of the panorama where it is certain. The U-Net learns a weight for each pixel."""
     without: list[str]
-    """Parts (of PARTS) to ablate.
-
-    - redundancy: all candidates are 0
-    - slopes: the panorama's candidates are 0
-    - shot_noise: isolated events do not move the level
-    - sums: the gains that move (s1, s2) by event sums are 0
-    - recurrence: recurrent layers restart in each window
-    - panorama: there is none
-    - sensitivity: events keep their weights
-    - scale: every sensor has the threshold `panorama_step`
-    """
+    """Parts (of PARTS) to ablate: redundancy (all candidates are 0), slopes (the panorama's candidates are 0),
+    shot_noise (isolated events do not move the level), sums (the gains of event sums are 0), recurrence (recurrent
+    layers restart in each window), panorama, sensitivity (events keep their weights), scale (every sensor has the
+    threshold `panorama_step`)."""
 
     def __post_init__(self):
         if len(self.channels) < 3 or not (self.memories and self.decays and self.scales):
@@ -152,25 +116,20 @@ class Solved(NamedTuple):
 class StokesUNet(nn.Module):
     """Recurrent network from the events of four channels to DoLP, AoLP and DoLP's expected squared error.
 
-    0. Sensor: each event is weighted by its pixel's estimated threshold relative to other pixels'
-       (`polarnet.networks.polarnet.sensitivity`), and all event sums by the sensor's estimated threshold
-       (`polarnet.networks.polarnet.threshold`).
+    0. Sensor: each event is weighted by its pixel's estimated threshold relative to other pixels', and all event sums
+       by the sensor's estimated threshold (module `sensor`).
     1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
        U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
        scale.
-    2. Shot noise: where there is much of it, the rates of isolated events move the level of the whole sensor
-       (`polarnet.networks.polarnet.shot_noise`).
-    3. Fine structure: e0 - e90 counts the change of 2 atanh(s1) at a pixel. Sums of such differences, times gains from
-       the U-Net, therefore update (s1, s2).
-    4. Panorama: the result is averaged with the panorama (module `panorama`), whose unknown constants are fitted to
-       the result around each pixel. The panorama has no trained parameters; the U-Net receives it as an input and
-       chooses its weight at each pixel.
-    5. Correction: the U-Net sees the result and adds an unconstrained correction.
+    2. Refinement (module `refinement`): where there is much shot noise, the rates of isolated events move the level of
+       the whole sensor. Event sums, times gains from the U-Net, add the fine structure. The result is averaged with
+       the panorama (module `panorama`), whose unknown constants are fitted to the result around each pixel. The
+       panorama has no trained parameters; the U-Net receives it as an input and chooses its weight at each pixel.
+    3. Correction: the U-Net sees the result and adds an unconstrained correction.
 
-    The state is a list. It starts with the numbers of isolated events and of quiet pixels, and the number of pixels
-    that fired around each pixel. The numbers of ON and OFF events and the change of their weights follow, then the
-    event sums, the sums of moments, and the sums averaged over each width of `WIDE`. The events of the previous window
-    with the panorama follow, then the states of the recurrent layers.
+    The state is a list: two tensors of isolated events, two of the pixels' sensitivities, the event sums, the sums of
+    moments, and the sums averaged over each width of `WIDE`; then the events of the previous window with the panorama,
+    and the states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
     like any mean over angles. The outputs are linear, as in the paper's network.
@@ -186,11 +145,8 @@ class StokesUNet(nn.Module):
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
         if in_channels != 4 * IMAGES:
-            raise ValueError(
-                f"network=polarnet takes {4 * IMAGES} images (representation event_counts), got {in_channels}"
-            )
-        self.binning = config.binning
-        self.scales = config.scales
+            raise ValueError(f"network=polarnet takes 8 images (representation event_counts), got {in_channels}")
+        self.binning, self.scales = config.binning, config.scales
         self.register_buffer("memories", torch.tensor(config.memories), persistent=False)
         self.register_buffer("decays", torch.tensor(config.decays), persistent=False)
         self.without = frozenset(config.without)
@@ -202,33 +158,31 @@ class StokesUNet(nn.Module):
         half, quarter, *smaller = config.channels
         self.equaliser = Equaliser()
         self.scale = Scale()
-        self.moments = SecondMoments(memories)
-        self.solve = LeastSquares(memories, len(config.decays), scales)
-        self.slopes = SlopeMoments()
-        self.solve_slopes = LeastSquares(1, 1, scales)
-        self.shot_noise = ShotNoise()
-        self.stem = conv3x3(4 * (4 * memories + 1), half)
+        self.moments = redundancy.SecondMoments(memories)
+        self.solve = redundancy.LeastSquares(memories, len(config.decays), scales)
+        self.slopes = redundancy.SlopeMoments()
+        self.solve_slopes = redundancy.LeastSquares(1, 1, scales)
+        self.shot_noise = refinement.ShotNoise()
+        self.stem = blocks.conv3x3(4 * (4 * memories + 1), half)
         self.from_mosaic = nn.Conv2d(5, half, kernel_size=3, padding=1, bias=False)  # name in shipped weights
         self.to_quarter = nn.Conv2d(half, quarter, kernel_size=2, stride=2)
         self.from_candidates = nn.Conv2d(len(Candidates._fields) * solved, quarter, kernel_size=1)
-        self.join = conv3x3(quarter, quarter)
-        self.gru_quarter = ConvGRU(quarter)
-        self.smaller = Level(quarter, smaller)
-        self.at_quarter = ResidualBlock(quarter)
+        self.join = blocks.conv3x3(quarter, quarter)
+        self.gru_quarter = blocks.ConvGRU(quarter)
+        self.smaller = blocks.Level(quarter, smaller)
+        self.at_quarter = blocks.ResidualBlock(quarter)
         self.choose = nn.Conv2d(quarter, solved + 1, kernel_size=1)
-        self.up_half = UpBlock(quarter, half)
-        self.at_half = ResidualBlock(half)
+        self.up_half = blocks.UpBlock(quarter, half)
+        self.at_half = blocks.ResidualBlock(half)
         self.gains = nn.Conv2d(half, 4 * (1 + len(WIDE)) * memories, kernel_size=1)
         self.trust = nn.Conv2d(half, 1, kernel_size=1)
-        self.look = conv3x3(half + 4 * 3, half)
-        self.refine = ResidualBlock(half)
+        self.look = blocks.conv3x3(half + 4 * 3, half)
+        self.refine = blocks.ResidualBlock(half)
         self.add = nn.Conv2d(half, 3 * 4, kernel_size=1)  # s1, s2 and DoLP of 2x2 pixels
         self.constant = nn.Parameter(torch.tensor(MIDDLE_DOLP))
         self.expected = ExpectedError()
-        for last in (self.choose, self.gains, self.add, self.trust):
-            assert last.bias is not None
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        for tensor in nn.ModuleList([self.choose, self.gains, self.add, self.trust]).parameters():
+            nn.init.zeros_(tensor)
         assert self.trust.bias is not None
         nn.init.constant_(self.trust.bias, math.log(config.panorama_share / (1 - config.panorama_share)))
 
@@ -258,7 +212,7 @@ class StokesUNet(nn.Module):
     def solve_windows(self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor]) -> tuple[Solved, list[Tensor]]:
         """First half of `unroll`: everything before the recurrent layers. `state` is empty at the start."""
         t, b, _, height, width = inputs.shape
-        noise, isolated = isolated_events(inputs.unflatten(2, (4, IMAGES))[:, :, :, 1], state[:NOISE_TENSORS])
+        noise, isolated = refinement.isolated_events(inputs[:, :, 1::IMAGES], state[:NOISE_TENSORS])
         side = STRIDE * self.binning
         inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
         polarity, count = inputs.unflatten(2, (4, IMAGES)).unbind(3)
@@ -275,16 +229,16 @@ class StokesUNet(nn.Module):
         clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
         scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
         images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
-        steps = faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
-        wide_steps = wide_differences(polarity, before_wide, keep)
+        steps = redundancy.faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
+        wide_steps = refinement.wide_differences(polarity, before_wide, keep)
         sums, wide = of_window * steps, [of_window * means for means in wide_steps]
         from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
         from_slopes = self._slope_candidates(images)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
-        x2 = on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
+        x2 = blocks.on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
         x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
-        solved = Solved(x2, candidates, [differences(sums), *wide], images, certain, noise, (height, width))
+        solved = Solved(x2, candidates, [refinement.differences(sums), *wide], images, certain, noise, (height, width))
         last_wide = [means[-1] for means in wide_steps]
         return solved, [*isolated, *sensitivity, steps[-1], moments, *last_wide, *next_panorama]
 
@@ -297,14 +251,15 @@ class StokesUNet(nn.Module):
         y4, recurrent = self._quarter(x2, candidates, b, state)
         y2 = self.at_half(self.up_half(y4, skip=x2))
 
-        weights = self.choose(y4).float().softmax(1)
-        coarse = enlarged(self._mixed(candidates, weights), 4)
+        weights = self.choose(y4).float().softmax(1)  # of the candidates, and of the constant, which is DoLP alone
+        s1, s2, dolp = ((weights[:, :-1] * field).sum(1, keepdim=True) for field in candidates[:3])
+        coarse = blocks.enlarged(torch.cat([s1, s2, dolp + weights[:, -1:] * self.constant], dim=1), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
-        level = moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
-        moved = moved_by_events(level, sums, gains)
+        level = refinement.moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
+        moved = refinement.moved_by_events(level, sums, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
-        share = certain * enlarged(torch.sigmoid(self.trust(y2).float()), 2)
-        fine = torch.cat(averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
+        share = certain * blocks.enlarged(torch.sigmoid(self.trust(y2).float()), 2)
+        fine = torch.cat(refinement.averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
         features = torch.cat([y2, F.pixel_unshuffle(fine, 2).to(y2.dtype)], dim=1)
         added = F.pixel_shuffle(self.add(self.refine(F.relu(self.look(features)))), 2).float()
 
@@ -327,16 +282,13 @@ class StokesUNet(nn.Module):
     def _candidates(
         self, events: Float[Tensor, "n m 4 h w"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None
     ) -> tuple[Candidates, Float[Tensor, "b d c h4 w4"]]:
-        """Return the candidates from changes in time, and the sums of moments for the next window.
-
-        Computed in float32, because the solution takes differences of similar numbers.
-        """
-        with torch.autocast(events.device.type, enabled=False):
+        """Return the candidates from changes in time, and the sums of moments for the next window."""
+        with torch.autocast(events.device.type, enabled=False):  # the solution takes differences of similar numbers
             windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
             moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
-            sums = faded(moments, self.decays.view(-1, 1, 1, 1), state)
-            shape = (len(self.decays), len(self.memories), MOMENTS)
-            near = neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
+            sums = redundancy.faded(moments, self.decays.view(-1, 1, 1, 1), state)
+            shape = (len(self.decays), len(self.memories), -1)
+            near = redundancy.neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)
             stacked = torch.stack([mean.unflatten(1, shape).transpose(1, 2) for mean in near], dim=3)
             s1, s2, evidence = self.solve(stacked)
             return Candidates(s1, s2, length(s1, s2), evidence), sums[-1]
@@ -345,7 +297,7 @@ class StokesUNet(nn.Module):
         """Return the candidates from the panorama's differences between neighbouring pixels, at quarter resolution."""
         with torch.autocast(images.device.type, enabled=False):
             moments = self.slopes(self._unless("redundancy", self._unless("slopes", 2 / self.step * images)))
-            stacked = torch.stack([*neighbourhoods(moments, self.scales)], dim=1)
+            stacked = torch.stack([*redundancy.neighbourhoods(moments, self.scales)], dim=1)
             s1, s2, _ = self.solve_slopes(stacked[:, None, None, :, :-1])
             return Candidates(s1, s2, length(s1, s2), stacked[:, :, -1])
 
@@ -355,30 +307,27 @@ class StokesUNet(nn.Module):
     ) -> tuple[Float[Tensor, "n 4 h/2 w/2"], Float[Tensor, "n 1 1 1"], list[Tensor]]:
         """Follow the panorama over t windows; return its four images, its certainty from 0 to 1, and the next state.
 
-        The four images are the mean of the four log intensities, atanh(s1), atanh(s2), and
-        ((log I0 + log I90) - (log I45 + log I135)) / 2. They are given after each window in steps, at half resolution,
-        each up to an additive constant.
-
-        The sensor covers the first rows and columns, `sensor` of them. Without the panorama (`without`), the images and
-        the certainty are 0.
+        The images, in steps and each up to a constant, are the mean of the four log intensities, atanh(s1), atanh(s2),
+        and ((log I0 + log I90) - (log I45 + log I135)) / 2. The sensor covers the first `sensor` rows and columns.
         """
         if not state:
-            state = [torch.zeros_like(polarity[0, :, 0]), *empty_panorama(polarity[0, ..., ::2, ::2], self.margin)]
+            empty = panoramas.empty_panorama(polarity[0, ..., ::2, ::2], self.margin)
+            state = [torch.zeros_like(polarity[0, :, 0]), *empty]
         before, level, own, explained = state
         if "panorama" in self.without:
             images = own.new_zeros(len(polarity) * len(own), *own.shape[1:])
             return images, images.new_zeros(len(images), 1, 1, 1), state
         with torch.autocast(polarity.device.type, enabled=False):
             events = torch.cat([before[None], polarity.sum(2)])
-            motion = displacements(events, self.reach)
+            motion = panoramas.displacements(events, self.reach)
             height, width = (size // 2 for size in sensor)
-            changes = block_means(contrasts(polarity) / 2, 2)[..., :height, :width]
-            panorama, panoramas = Panorama(level, own[..., :height, :width], explained), []
+            changes = block_means(blocks.contrasts(polarity) / 2, 2)[..., :height, :width]
+            panorama, after = Panorama(level, own[..., :height, :width], explained), []
             for change, displacement, reliable in zip(changes, motion.displacement / 2, motion.reliable, strict=True):
-                panorama = follow(change, Motion(displacement, reliable), panorama, self.memory)
-                panoramas.append(panorama)
-            images = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in panoramas])
-            certain = torch.cat([certainty(one, self.memory) for one in panoramas])
+                panorama = panoramas.follow(change, Motion(displacement, reliable), panorama, self.memory)
+                after.append(panorama)
+            images = torch.cat([one.level[..., : own.shape[-2], : own.shape[-1]] for one in after])
+            certain = torch.cat([panoramas.certainty(one, self.memory) for one in after])
             own = F.pad(panorama.own, (0, own.shape[-1] - width, 0, own.shape[-2] - height))
             return images, certain, [events[-1], panorama.level, own, panorama.explained]
 
@@ -389,21 +338,15 @@ class StokesUNet(nn.Module):
         inputs = torch.cat([*candidates[:3], torch.log1p(candidates.evidence)], dim=1)
         inputs = inputs.contiguous(memory_format=torch.channels_last)
         x4 = F.relu(self.join(F.relu(self.to_quarter(x2) + self.from_candidates(inputs))))
-        if "recurrence" in self.without:
-            streams, state = len(x4), []
+        restarts = "recurrence" in self.without
+        streams, state = (len(x4), []) if restarts else (streams, state)
         g4, first = self.gru_quarter(x4, streams, state[0] if state else None)
         y4, smaller = self.smaller(g4, streams, state[1:])
-        return self.at_quarter(y4), [] if "recurrence" in self.without else [first, *smaller]
+        return self.at_quarter(y4), [] if restarts else [first, *smaller]
 
     def _enlarged(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
         """Interpolate maps of blocks to the sensor's pixels."""
-        return maps if self.binning == 1 else enlarged(maps, self.binning)
-
-    def _mixed(self, candidates: Candidates, weights: Float[Tensor, "n c1 h w"]) -> Float[Tensor, "n 3 h w"]:
-        """Mix the candidates to s1, s2 and DoLP. The last weight belongs to the constant, which adds to DoLP only."""
-        mixed = [(weights[:, :-1] * field).sum(1, keepdim=True) for field in candidates[:3]]
-        mixed[2] = mixed[2] + weights[:, -1:] * self.constant
-        return torch.cat(mixed, dim=1)
+        return maps if self.binning == 1 else blocks.enlarged(maps, self.binning)
 
     def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return `x`, or 0 * x if this part is left out (which keeps the gradient path)."""
@@ -419,5 +362,7 @@ def _panorama_images(images: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n
 def _event_images(sums: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:
     """Stack the U-Net's input from the events: contrasts of every event sum, and the number of events."""
     windows = zip(sums.split(1), count.split(1), strict=True)  # a single window fits into a core's cache
-    inputs = (torch.cat([contrasts(one).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for one, each in windows)
-    return torch.cat([compressed(images).contiguous(memory_format=torch.channels_last) for images in inputs])
+    inputs = (
+        torch.cat([blocks.contrasts(one).flatten(1, 2), each.sum(1, keepdim=True) / 2], dim=1) for one, each in windows
+    )
+    return torch.cat([blocks.compressed(images).contiguous(memory_format=torch.channels_last) for images in inputs])

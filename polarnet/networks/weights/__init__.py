@@ -13,7 +13,7 @@ def shipped_weights() -> Path:
     path = Path(__file__).parent / "polarnet.safetensors"
     if not path.is_file():
         raise FileNotFoundError(
-            f"{path} is not there: this version ships no weights. Give --weights FILE, the best.safetensors of a "
-            f"training (`dvc repro train` leaves one in data/train/ours), or --method highpass, which needs none"
+            f"{path} is missing. Give --weights FILE, the best.safetensors of a training (`dvc repro train` leaves one "
+            f"in data/train/ours), or --method highpass, which needs none"
         )
     return path

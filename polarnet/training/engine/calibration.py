@@ -1,13 +1,8 @@
 """Expected-error fit: a map from features to the log-variance of DoLP's error, fitted after training.
 
 The log of the expected squared error is a linear function of the features, fitted by maximum likelihood under normal
-errors, which is a convex problem.
-
-There are many pixels but few scenes, so a ridge penalty guards against overfitting. Cross-validation over left-out
-scenes selects the ridge. If the features do not help on left-out scenes, the fit expects the same error everywhere.
-
-How large errors are depends on how strongly the scenes are polarized. `weights_for` weights sequences so that their
-mean DoLP is distributed as in the scenes that the network is meant for.
+errors, which is a convex problem. There are many pixels but few scenes, so cross-validation over left-out scenes
+selects a ridge penalty. If the features do not help there, the fit expects the same error everywhere.
 """
 
 import statistics
@@ -31,7 +26,6 @@ class Scene(NamedTuple):
 
     features: Float[Tensor, "n c"]
     squared: Float[Tensor, " n"]
-    """Squared errors."""
     weights: Float[Tensor, " n"]
     """Weights of the pixels in the fit; only their ratios matter."""
 
@@ -55,7 +49,7 @@ class ExpectedErrors(NamedTuple):
 
 
 def weights_for(dolp: Sequence[float], median: float, ninetieth: float) -> list[float]:
-    """Weights of sequences, with these mean DoLPs, for scenes whose mean DoLP is log-normal.
+    """Weights of sequences, with these mean DoLPs, for scenes whose mean DoLP is log-normal; errors grow with DoLP.
 
     `median` and `ninetieth` are the distribution's median and 90th percentile. The range of DoLP is cut halfway between
     neighbouring values, on a logarithmic scale. A sequence weighs as much as the distribution has in its part. The sum

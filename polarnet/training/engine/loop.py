@@ -18,20 +18,20 @@ from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
 from polarnet.training.engine.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.engine.losses import known_frames
-from polarnet.training.engine.optimizers import OPTIMIZERS
+from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
 from polarnet.training.engine.parallel import add_up, place, wait_for_all
 from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.sequences import (
     Batch,
     ViewConfig,
     Visits,
+    WindowDataset,
     batches_of,
     loaded_if_it_fits,
     parts_of,
     shuffled,
 )
 from polarnet.training.engine.task import Split, State, Task
-from polarnet.training.engine.windows import WindowDataset
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
 COPIES_OF_WEIGHTS = 12  # on disk: best, last, and twice (old and new) the running checkpoint with best and two moments
@@ -93,10 +93,10 @@ def train(
 ) -> None:
     """Train the task's network, or resume a killed run of the same training that the recorder holds.
 
-    All random numbers derive from the seed, the epoch and the sequence's name. A resumed run therefore ends with the
-    same weights as an uninterrupted one. The number of workers (processes that read ahead) does not change the weights
-    either. All processes that share a training (module `parallel`) call this function; their number changes the weights
-    by rounding only. OSError if the disk has no room for the checkpoints.
+    All random numbers derive from the seed, the epoch and the sequence's name, so neither an interruption nor the
+    number of workers (processes that read ahead) changes the weights. All processes that share a training (module
+    `parallel`) call this function; their number changes the weights by rounding only. OSError if the disk has no room
+    for the checkpoints.
     """
     weights = sum(tensor.nbytes for tensor in task.network.state_dict().values())
     check_room(recorder.running, COPIES_OF_WEIGHTS * weights, "the checkpoints")
@@ -121,20 +121,18 @@ def train(
         recorder.keep(progress, network, optimizer, at_once=True)
     if task.unroll_with_features is not None and recorder.writes:
         network.load_state_dict(progress.best)
-        recorder.calibrated(
-            progress, network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers)
-        )
+        fit = calibrate(task, sequences_to_fit(task, split.train), config, device, workers)
+        recorder.calibrated(progress, network, fit)
     recorder.finish()
 
 
 def train_batch(
-    task: Task, optimizer: torch.optim.Optimizer, batch: Batch, config: LoopConfig, device: torch.device
+    task: Task, optimizer: Optimizer, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step.
 
     The batch is split into parts, and this process passes its own parts through the network one after another. The loss
-    of a part is a mean over its frames. It is weighted by the part's share of all frames, over all processes, that have
-    a valid pixel.
+    of a part is weighted by its share of all frames, over all processes, that have a valid pixel.
     """
     rank, processes = place()
     parts = parts_of(batch, processes * config.accumulate)[rank::processes]
@@ -142,7 +140,7 @@ def train_batch(
     states: list[State] = [None] * len(parts)
     losses = []
     for number in range(math.ceil(len(batch.inputs) / config.bptt_windows)):
-        optimizer.zero_grad()
+        task.network.zero_grad()
         sums = torch.zeros(1 + len(task.loss.weights), device=device)
         counts = [frames_known(frames, valid) for _, frames, valid in (run[number] for run in runs)]
         known = torch.tensor(float(sum(counts)), device=device)
@@ -217,13 +215,11 @@ def validate(
     add_up([together])
     *totals, count = together.tolist()
     if not count:
-        raise ValueError(
-            f"{dataset.frames.path}: no frame of the validation split has a valid pixel; use other pictures"
-        )
+        raise ValueError(f"{dataset.frames.path}: no validation frame has a valid pixel; use other pictures")
     return {name: value / count for name, value in zip(sums, totals, strict=True)}
 
 
-def set_learning_rate(optimizer: torch.optim.Optimizer, config: LoopConfig, done: float) -> None:
+def set_learning_rate(optimizer: Optimizer, config: LoopConfig, done: float) -> None:
     """Set the learning rate for the fraction `done` of the training: peak rate times warm-up times schedule."""
     rise = min(1.0, done / config.warmup) if config.warmup else 1.0
     fall = (1 + math.cos(math.pi * done)) / 2 if config.schedule == "cosine" else 1.0
@@ -254,7 +250,7 @@ def calibrate(
 
     The fit also includes one frame of each sequence predicted without any events. If the task names the DoLP of real
     scenes, half of its weight is on the pictures, and half on all sequences, with `weights_for` such scenes. Returns a
-    record of the fit for the checkpoint. ValueError if the network has no error at all.
+    record of the fit for the checkpoint.
     """
     task.network.eval()
     sampled: dict[str, Scene] = {}
@@ -288,16 +284,15 @@ def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch
     for run in runs:
         sample, state = sampled_errors(task, run, state, every, config.precision)
         samples.append(sample)
-    mse = torch.cat([sample.squared for sample in samples]).mean().item()
     windows, frames, valid = runs[0]
     still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
-    return joined([*samples, sampled_errors(task, still, None, every, config.precision)[0]]), mse
+    both = joined([*samples, sampled_errors(task, still, None, every, config.precision)[0]])
+    return both, joined(samples).squared.mean().item()
 
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
     """Features and squared errors of one 2x2-pixel block in `every` along each axis, and the state after the run."""
-    if task.unroll_with_features is None:
-        raise ValueError("expected a task whose network predicts the size of its errors")
+    assert task.unroll_with_features is not None
     windows, frames, valid = run
     with autocast(precision, windows.device):
         predicted, features, state = task.unroll_with_features(windows, state)

@@ -63,7 +63,7 @@ class FrameLoss:
         if lpips is not None:
             known["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
         self.weights = {name: weight for name, weight in weights.items() if weight}
-        self._terms = {name: known[name] for name in self.weights}
+        self._terms = {name: known[name] for name in self.weights if name in known}
 
     def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
         """Return the terms by name, before their weights; all are 0 if no frame has a valid pixel."""
@@ -84,12 +84,9 @@ class PolarizationLoss(FrameLoss):
     """
 
     def __init__(self, config: LossConfig, lpips: Lpips | None, *, dolp_only: bool):
-        prefix = "" if config.half_weight is None else "relative_"
-        of_dolp = {f"{prefix}mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}
-        super().__init__({name: weight for name, weight in of_dolp.items() if name != "relative_mse"}, lpips)
-        more = {} if dolp_only else {f"{prefix}stokes": config.stokes}
-        self.weights = {name: weight for name, weight in (of_dolp | more).items() if weight}
-        self._half_weight = config.half_weight
+        self._half_weight, prefix = config.half_weight, "" if config.half_weight is None else "relative_"
+        weights = {f"{prefix}mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}
+        super().__init__(weights | ({} if dolp_only else {f"{prefix}stokes": config.stokes}), lpips)
 
     def __call__(
         self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
@@ -99,25 +96,18 @@ class PolarizationLoss(FrameLoss):
         The maps are DoLP, s1 and s2; `predicted` may be DoLP alone.
         """
         terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
-        if "relative_mse" in self.weights:
-            squared = (predicted[:, :, 0] - truth[:, :, 0]).square()
-            terms["relative_mse"] = self._relative(squared, truth, valid)
-        if "stokes" in self.weights:
-            terms["stokes"] = _mean_of_known(_stokes_errors(predicted, truth), valid)
-        if "relative_stokes" in self.weights:
-            terms["relative_stokes"] = self._relative(_stokes_errors(predicted, truth), truth, valid)
+        for name in [name for name in self.weights if name not in terms]:
+            maps = slice(0, 1) if name == "relative_mse" else slice(1, None)
+            errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
+            terms[name] = _mean_of_known(errors * self._weight_of(truth[:, :, 0], valid)[..., None, None], valid)
         return {name: terms[name] for name in self.weights}
 
-    def _relative(self, errors: Frames, truth: Float[Tensor, "t b m h w"], valid: Valid) -> Float[Tensor, ""]:
-        """Mean of `errors` in which a frame counts fully if it is unpolarized, and less the higher its DoLP."""
-        assert self._half_weight is not None
-        level = mean_where(truth[:, :, 0].square(), valid).nan_to_num(0.0)  # NaN: no valid pixel
-        return _mean_of_known(errors * (self._half_weight / (self._half_weight + level))[..., None, None], valid)
-
-
-def _stokes_errors(predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"]) -> Frames:
-    """Squared error of (s1, s2) at each pixel."""
-    return (predicted[:, :, 1:] - truth[:, :, 1:]).square().sum(2)
+    def _weight_of(self, dolp: Frames, valid: Valid) -> Float[Tensor, "t b"]:
+        """Weight of each frame: 1 if it is unpolarized, and less the higher its mean squared DoLP."""
+        if self._half_weight is None:
+            return torch.ones_like(dolp[..., 0, 0])
+        level = mean_where(dolp.square(), valid).nan_to_num(0.0)  # NaN: no valid pixel
+        return self._half_weight / (self._half_weight + level)
 
 
 def _mean_of_known(of_pixels: Frames, valid: Valid) -> Float[Tensor, ""]:

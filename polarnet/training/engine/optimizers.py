@@ -1,14 +1,14 @@
 """Optimizers by their names in params.yaml."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim import Adam, Optimizer
+from torch.optim import Adam
 
 
-class Muon(Optimizer):
+class Muon:
     """Muon for the weights of hidden layers, Adam for everything else, as recommended by Jordan et al. (2024).
 
     Muon steps along the orthogonalised momentum of the gradient, so all directions of a layer's matrix move equally;
@@ -22,33 +22,26 @@ class Muon(Optimizer):
         outputs = tuple(f"{name}." for name in getattr(network, "outputs", ()))
         named = list(network.named_parameters())
         hidden = {name for name, weight in named if weight.ndim > 1 and not name.startswith(outputs)}
-        self._weights = [weight for name, weight in named if name in hidden]
-        self._matrices: list[Tensor] = [nn.Parameter(weight.detach().flatten(1).clone()) for weight in self._weights]
-        self._others = [weight for name, weight in named if name not in hidden]
-        self._muon = torch.optim.Muon(
-            self._matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"
-        )
-        self._adam = Adam(self._others, lr=learning_rate, fused=True)
-        super().__init__([*self._matrices, *self._others], {"lr": learning_rate})
-        self._share_groups()
+        weights = [weight for name, weight in named if name in hidden]
+        matrices: list[Tensor] = [nn.Parameter(weight.detach().flatten(1).clone()) for weight in weights]
+        self._pairs = list(zip(matrices, weights, strict=True))
+        self._muon = torch.optim.Muon(matrices, lr=learning_rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+        self._adam = Adam([weight for name, weight in named if name not in hidden], lr=learning_rate, fused=True)
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Reset the gradients of the network's weights."""
-        for weight in (*self._weights, *self._others):
-            if set_to_none:
-                weight.grad = None
-            elif weight.grad is not None:
-                weight.grad.zero_()
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Settings of both optimizers, whose `lr` the training loop sets."""
+        return [*self._muon.param_groups, *self._adam.param_groups]
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Update the weights that have gradients; there is no `closure`."""
+    def step(self) -> None:
+        """Update the weights that have gradients."""
         self._adam.step()
-        for matrix, weight in self._pairs():
+        for matrix, weight in self._pairs:
             matrix.copy_(weight.flatten(1))
             matrix.grad = None if weight.grad is None else weight.grad.flatten(1)
         self._muon.step()
-        for matrix, weight in self._pairs():
+        for matrix, weight in self._pairs:
             weight.copy_(matrix.view(weight.shape))
 
     def state_dict(self) -> dict[str, Any]:
@@ -59,14 +52,9 @@ class Muon(Optimizer):
         """Restore the state of both optimizers."""
         self._muon.load_state_dict(state_dict["muon"])
         self._adam.load_state_dict(state_dict["adam"])
-        self._share_groups()
 
-    def _share_groups(self) -> None:
-        """Let a learning rate that is set here, as by torch's schedulers, hold in both optimizers."""
-        self.param_groups = [*self._muon.param_groups, *self._adam.param_groups]
 
-    def _pairs(self) -> Iterator[tuple[Tensor, Tensor]]:
-        return zip(self._matrices, self._weights, strict=True)
+Optimizer = torch.optim.Optimizer | Muon
 
 
 def _adam(network: nn.Module, learning_rate: float) -> Optimizer:

@@ -1,8 +1,7 @@
 """Data-parallel training: several processes share a training, and each takes a part of every batch.
 
 torchrun or `launched` starts the processes. They sum their gradients before each step, so the result equals that of
-one process with the same batches, up to rounding. Without torchrun's environment there is one process, and `join`,
-`add_up` and `wait_for_all` do nothing.
+one process with the same batches, up to rounding. With one process, `join`, `add_up` and `wait_for_all` do nothing.
 """
 
 import functools
@@ -18,10 +17,9 @@ from polarnet.runtime.machine import RuntimeConfig, end_with_parent
 
 
 def launched(module: str, runtime: RuntimeConfig) -> bool:
-    """Start `python -m module` with this command line in `runtime.devices` processes and wait for them.
+    """Run `python -m module` with this command line in `runtime.devices` processes; RuntimeError if one fails.
 
-    Returns False without starting anything if one process is enough or if torchrun started this process. RuntimeError
-    if a process fails.
+    Returns False without starting anything if one process is enough or if torchrun started this process.
     """
     if "WORLD_SIZE" in os.environ or runtime.devices * runtime.nodes == 1:
         return False

@@ -1,9 +1,11 @@
 """Outputs of a training: checkpoints, history, and the running checkpoint for resuming a killed run.
 
-The outputs contain no dates or durations, so equal trainings write equal bytes.
+The outputs contain no dates or durations, so equal trainings write equal bytes. The history, history.csv, has one line
+for each epoch, which DVC plots and the report and sweeps read.
 """
 
 import contextlib
+import csv
 import json
 import math
 import shutil
@@ -19,13 +21,52 @@ import torch
 from torch import Tensor, nn
 
 from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.runtime.files import claimed, replaced, seal, sha256
+from polarnet.runtime.files import check_seal, claimed, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
-from polarnet.training.engine.history import Row, best_row, write_history
+from polarnet.training.engine.optimizers import Optimizer
 from polarnet.training.engine.parallel import place, wait_for_all
 from polarnet.training.engine.sequences import Batch
 
 KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
+HISTORY = "history.csv"
+
+Row = Mapping[str, Any]
+"""An epoch: `epoch` (from 0), `train` (mean loss terms by name) and `val` (validation scores by name)."""
+
+
+def write_history(folder: Path, rows: Sequence[Row]) -> None:
+    """Write the columns epoch, train_TERM and val_SCORE."""
+    lines = [
+        {"epoch": row["epoch"]}
+        | {f"{split}_{name}": value for split in ("train", "val") for name, value in row[split].items()}
+        for row in rows
+    ]
+    with (folder / HISTORY).open("w", newline="") as file:
+        writer = csv.DictWriter(file, lines[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def read_history(folder: Path) -> list[Row]:
+    """Read what `write_history` wrote, to the last digit; ValueError for a changed file or one without epochs."""
+    check_seal(folder, [HISTORY])
+    with (folder / HISTORY).open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    if not lines:
+        raise ValueError(f"{folder / HISTORY}: expected a line for each epoch, got none; train again")
+    rows: list[Row] = []
+    for line in lines:
+        row: dict[str, Any] = {"epoch": int(line.pop("epoch")), "train": {}, "val": {}}
+        for name, value in line.items():
+            split, _, score = name.partition("_")
+            row[split][score] = float(value)
+        rows.append(row)
+    return rows
+
+
+def best_row(rows: Sequence[Row]) -> Row:
+    """Return the epoch with the smallest validation MSE; the first one if several are equal."""
+    return min(rows, key=lambda row: row["val"]["mse"])
 
 
 @dataclass
@@ -84,16 +125,14 @@ class Recorder:
         self._claims = contextlib.ExitStack()
         if self.writes:
             self._claims.enter_context(claimed(out))
-            self._claims.enter_context(claimed(self.running, self._say_waiting))
+            waiting = f"waiting until an equal training ends, whose running checkpoint is in {self.running}"
+            self._claims.enter_context(claimed(self.running, lambda: ProgressBar.write(waiting)))
             shutil.rmtree(out, ignore_errors=True)
             out.mkdir(parents=True)
         wait_for_all()  # no process reads the running checkpoint of the training that the first one waits for
 
-    def resume(self, network: nn.Module, optimizer: torch.optim.Optimizer) -> Progress:
-        """Restore network and optimizer from the running checkpoint, if it exists, and return the progress.
-
-        ValueError if the file is damaged.
-        """
+    def resume(self, network: nn.Module, optimizer: Optimizer) -> Progress:
+        """Restore network and optimizer from the running checkpoint, if there is one; ValueError if it is damaged."""
         file = self.running / "running.pt"
         if not file.exists():
             return Progress()
@@ -106,28 +145,20 @@ class Recorder:
             self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
         return progress
 
-    def keep(
-        self, progress: Progress, network: nn.Module, optimizer: torch.optim.Optimizer, at_once: bool = False
-    ) -> None:
+    def keep(self, progress: Progress, network: nn.Module, optimizer: Optimizer, at_once: bool = False) -> None:
         """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
         if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
             return
         self.running.mkdir(parents=True, exist_ok=True)
-        content = {
-            "network": network.state_dict(),
-            "optimizer": optimizer.state_dict(),
-            "progress": asdict(progress),
-        }
+        states = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
         with replaced(self.running / "running.pt") as temporary:
-            torch.save(content, temporary)
+            torch.save({**states, "progress": asdict(progress)}, temporary)
         self.kept_at = time.monotonic()
 
     def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
         """Yield the batches and show a progress bar that counts visits to sequences."""
-        with ProgressBar(
-            total=visits, initial=progress.visits, desc=f"epoch {progress.epoch + 1}/{epochs}", unit="visit",
-            disable=not self.writes,
-        ) as bar:  # fmt: skip
+        epoch, off = f"epoch {progress.epoch + 1}/{epochs}", not self.writes
+        with ProgressBar(total=visits, initial=progress.visits, desc=epoch, unit="visit", disable=off) as bar:
             for batch in batches:
                 yield batch
                 bar.update(len(batch.names))
@@ -143,9 +174,8 @@ class Recorder:
 
     def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
         """Rewrite the best checkpoint with the fitted expected errors of `network` and the record of the fit."""
-        result = _result(best_row(progress.history))
-        metadata = {**self.metadata, **result, "expected_errors": dict(expected_errors)}
-        save_checkpoint(self.out / "best.safetensors", network.state_dict(), metadata)
+        best = best_row(progress.history)
+        self._save("best", network.state_dict(), best, expected_errors=dict(expected_errors))
         seal(self.out)
 
     def finish(self) -> None:
@@ -154,16 +184,16 @@ class Recorder:
             shutil.rmtree(self.running, ignore_errors=True)
             self._claims.close()
 
-    def _say_waiting(self) -> None:
-        ProgressBar.write(f"waiting until an equal training ends, whose running checkpoint is in {self.running}")
-
     def _write(self, progress: Progress, network: nn.Module) -> None:
-        last = progress.history[-1]
-        best = best_row(progress.history)
-        save_checkpoint(self.out / "last.safetensors", network.state_dict(), {**self.metadata, **_result(last)})
-        save_checkpoint(self.out / "best.safetensors", progress.best, {**self.metadata, **_result(best)})
+        last, best = progress.history[-1], best_row(progress.history)
+        self._save("last", network.state_dict(), last)
+        self._save("best", progress.best, best)
         write_history(self.out, progress.history)
         seal(self.out)
+
+    def _save(self, name: str, weights: Mapping[str, Tensor], row: Row, **more: Any) -> None:
+        metadata = {**self.metadata, "epoch": row["epoch"], "val": row["val"], **more}
+        save_checkpoint(self.out / f"{name}.safetensors", weights, metadata)
 
 
 def read_running(file: Path) -> dict[str, Any]:
@@ -179,7 +209,3 @@ def read_running(file: Path) -> dict[str, Any]:
     except Exception as error:  # torch and zipfile raise many kinds of exceptions
         damaged = str(error)
     raise ValueError(f"{file} is damaged ({damaged}); delete it to start the training anew")
-
-
-def _result(row: Row) -> dict[str, Any]:
-    return {"epoch": row["epoch"], "val": row["val"]}

@@ -1,4 +1,7 @@
-"""Training batches: sequences, augmented and stacked. The seed alone determines them."""
+"""Sequences of stored or emulated events with their truth, cut into encoded windows, and batches of them.
+
+Batches are augmented; the seed alone determines them.
+"""
 
 import functools
 import math
@@ -8,19 +11,63 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import psutil
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int8
 from pydantic import Field, PositiveInt
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from polarnet.events.representations import Encode
+from polarnet.events.windows import encode_windows
 from polarnet.runtime.machine import generator_for, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
-from polarnet.training.engine.windows import WindowDataset, WindowSequence
-
-Sequences = WindowDataset | list[WindowSequence]
+from polarnet.simulation.fly import EmulatedEvents
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 MEMORY_SHARE = 0.7  # share of the free memory that the sequences of a training may take
 EIGHTH_TURN = math.pi / 4  # angle between neighbouring polarizers
+
+
+class WindowSequence(NamedTuple):
+    """All windows of a sequence, with the truth at the end of each."""
+
+    name: str
+    inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
+    """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
+
+    int8 only in the memory of a training, where that is exact.
+    """
+    dolp: Float[Tensor, "t h w"]
+    aolp: Float[Tensor, "t h w"]
+    intensity: Float[Tensor, "t 4 h w"]
+    """Empty (t = 0) in the memory of a training that does not need intensities."""
+    valid: Bool[Tensor, "t h w"] | None = None
+    """Where the truth is known; None: everywhere."""
+
+
+class WindowDataset(Dataset[WindowSequence]):
+    """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
+
+    def __init__(self, events: EventStore | EmulatedEvents, frames: FrameStore, sequences: list[str], encode: Encode):
+        absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
+        if absent:
+            raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
+        if (events.height, events.width) != (frames.height, frames.width):
+            raise ValueError(
+                f"events are {events.height}x{events.width} px ({events.path}), "
+                f"frames {frames.height}x{frames.width} ({frames.path}); write both from the same scenes"
+            )
+        self.events, self.frames, self.sequences, self.encode = events, frames, sequences, encode
+
+    def __len__(self) -> int:
+        return len(self.sequences)
+
+    def __getitem__(self, i: int) -> WindowSequence:
+        name = self.sequences[i]
+        t_us, intensity, dolp, aolp, valid = self.frames.frames(name)
+        inputs = encode_windows(self.events.read(name), t_us, self.encode)
+        known = None if valid is None else valid[1:]
+        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:], known)
 
 
 class Batch(NamedTuple):
@@ -38,9 +85,8 @@ class Batch(NamedTuple):
 class View(NamedTuple):
     """An augmented view of a sequence: a range of windows and a crop, optionally mirrored, with renumbered polarizers.
 
-    Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence. This rotates the sensor's
-    polarizers by turn * 45 degrees against the scene, and reverses their order if direction is -1. DoLP does not
-    change.
+    Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence: the polarizers are rotated by
+    turn * 45 degrees against the scene, in reverse order if direction is -1. DoLP does not change.
     """
 
     start: int
@@ -68,9 +114,8 @@ def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
     aolp = view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN)
     intensity = cropped(sequence.intensity)[:, polarizers]
     valid = None if sequence.valid is None else cropped(sequence.valid)
-    return WindowSequence(
-        sequence.name, inputs, cropped(sequence.dolp), torch.remainder(aolp, math.pi), intensity, valid
-    )
+    aolp = torch.remainder(aolp, math.pi)
+    return WindowSequence(sequence.name, inputs, cropped(sequence.dolp), aolp, intensity, valid)
 
 
 @section
@@ -108,7 +153,7 @@ def random_view(count: int, height: int, width: int, config: ViewConfig, generat
 class Visits(Dataset[WindowSequence]):
     """All visits of one epoch. Seed, epoch, sequence name and visit number determine the view of each visit."""
 
-    def __init__(self, sequences: Sequences, config: ViewConfig, seed: int, epoch: int):
+    def __init__(self, sequences: WindowDataset | list[WindowSequence], config: ViewConfig, seed: int, epoch: int):
         self.sequences, self.config, self.seed, self.epoch = sequences, config, seed, epoch
 
     def __len__(self) -> int:
@@ -134,20 +179,16 @@ def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> 
     workers = workers if workers > 1 else 0
     packing = functools.partial(packed, intensity=intensity)
     loader = DataLoader(dataset, batch_size=None, collate_fn=packing, num_workers=workers)
+
+    def own(field: Tensor | None) -> Tensor | None:  # not in the limited memory shared with the worker that read it
+        return field.clone() if workers and field is not None else field
+
     with memory_handed_back():
-        return [_own(sequence) if workers else sequence for sequence in loader]
-
-
-def _own(sequence: WindowSequence) -> WindowSequence:
-    """Copy a sequence out of the memory shared with the worker that read it, which is limited."""
-    return WindowSequence(sequence.name, *(None if field is None else field.clone() for field in sequence[1:]))  # type: ignore[arg-type]
+        return [WindowSequence(name, *map(own, fields)) for name, *fields in loader]  # type: ignore[arg-type]
 
 
 def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
-    """Store the inputs as int8 if that is exact, as it nearly always is for event counts.
-
-    The intensity is the largest part of a sequence; it is dropped unless `intensity` is true.
-    """
+    """Store the inputs as int8 if that is exact, as for most event counts; drop the intensity unless `intensity`."""
     if not intensity:
         sequence = sequence._replace(intensity=sequence.intensity[:0].clone())
     small = sequence.inputs.to(torch.int8)
@@ -167,12 +208,10 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
 
 def parts_of(batch: Batch, parts: int) -> list[Batch]:
     """Split a batch into `parts` parts of nearly equal size, or into single visits if it has fewer visits."""
-    numbers = torch.arange(len(batch.names)).tensor_split(min(parts, len(batch.names)))
-    ranges = [slice(int(part[0]), int(part[-1]) + 1) for part in numbers]
-    return [
-        Batch(batch.names[part], *(None if field is None else field[:, part] for field in batch[1:]))  # type: ignore
-        for part in ranges
-    ]
+    parts = min(parts, len(batch.names))
+    names = [part.tolist() for part in np.array_split(batch.names, parts)]
+    fields = [[None] * parts if field is None else field.tensor_split(parts, dim=1) for field in batch[1:]]  # type: ignore
+    return [Batch(*part) for part in zip(names, *fields, strict=True)]
 
 
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:

@@ -23,8 +23,7 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import is_url
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.losses import FrameLoss
-from polarnet.training.engine.sequences import Batch
-from polarnet.training.engine.windows import EventSource, WindowDataset
+from polarnet.training.engine.sequences import Batch, WindowDataset
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)
@@ -42,8 +41,7 @@ class Task:
     ]
     """Function from a batch to the network's input, the truth, and the mask of known truth (None: all known)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
-    """Function from consecutive windows and a state to the predicted maps (k of them, or a single one without the axis
-    k) and the next state."""
+    """Function from consecutive windows and a state to k predicted maps (or one, without the axis) and a state."""
     loss: FrameLoss
     description: Mapping[str, Any]
     """Metadata of the network and its input for checkpoints: at least "network", "config" and "in_channels"."""
@@ -52,8 +50,7 @@ class Task:
     optimizer: str = "adam"
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
-    """Function that picks the map to score from the predicted or true maps; its validation MSE selects the best
-    epoch."""
+    """Function that picks the map to score from predicted or true maps; its validation MSE selects the best epoch."""
     unroll_with_features: (
         Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
     ) = None
@@ -94,15 +91,13 @@ def open_events(
     return EmulatedEvents(SceneStore.open(scenes), camera, seed, threads)
 
 
-def open_split(events: EventSource, frames: str, encode: Encode) -> Split:
+def open_split(events: EventStore | EmulatedEvents, frames: str, encode: Encode) -> Split:
     """Open the training and validation sequences; ValueError if either split is empty."""
     frame_store = FrameStore.open(frames)
     names = {split: frame_store.of_split(split) for split in Split._fields}
     for split, sequences in names.items():
         if not sequences:
-            raise ValueError(
-                f"{frames} has no sequence in split {split!r}; ingest more pictures or change the fractions"
-            )
+            raise ValueError(f"{frames} has no sequence in split {split!r}; ingest more pictures or change fractions")
     return Split(**{s: WindowDataset(events, frame_store, sequences, encode) for s, sequences in names.items()})
 
 
@@ -116,20 +111,15 @@ def initialised(build: Callable[[], Network], seed: int) -> Network:
 def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
     """Collect everything that determines the weights, for a checkpoint's JSON and the running checkpoint's key.
 
-    `training.precision` and `training.optimizer` are the resolved values: the precision used on `device` and the
-    optimizer used for the network.
+    `training.precision` and `training.optimizer` are those in use on `device` and for the network.
     """
     events, frames = split.train.events, split.train.frames
     settings = {name: value for name, value in asdict(config).items() if name != "start"}  # start_sha256 stands for it
+    precision = precision_on(device, config.precision)
     lpips = stored_record(weights, "loss") if any("lpips" in term for term in task.loss.weights) else NO_RECORD
     return {
         **task.description,
-        "training": {
-            "seed": seed,
-            **settings,
-            "optimizer": task.optimizer,
-            "precision": precision_on(device, config.precision),
-        },
+        "training": {"seed": seed, **settings, "optimizer": task.optimizer, "precision": precision},
         "loss": dict(task.loss.weights),
         "lpips": {key: lpips[key] for key in ("backbone", "sha256")},
         "data": {

@@ -1,11 +1,15 @@
-"""Relative sensitivities of a sensor's pixels, estimated from their numbers of events.
+"""Contrast thresholds of a sensor, estimated from its events: of pixels relative to each other, and on the whole.
 
-Contrast thresholds differ between pixels, and a pixel's ON and OFF thresholds differ independently. A pixel with half
-the threshold fires about twice as often. In a moving scene, neighbouring pixels see nearly the same changes of light.
-The number of a pixel's events relative to its neighbours' therefore measures its sensitivity.
+A pixel with half the threshold fires about twice as often. In a moving scene, neighbouring pixels see nearly the same
+changes of light. The number of a pixel's events relative to its neighbours' therefore measures its sensitivity, for ON
+and OFF events apart. Counts are noisy. `Equaliser` also estimates how much sensitivities differ over the sensor, and
+moves each pixel's count towards its neighbours' by the corresponding amount (empirical Bayes). A sensor without
+mismatch keeps its events.
 
-Counts are noisy. `Equaliser` also estimates how much sensitivities differ over the sensor, and moves each pixel's count
-towards its neighbours' by the corresponding amount (empirical Bayes). A sensor without mismatch keeps its events.
+The logarithm of light scaled by a factor gives the same events as a threshold divided by it, so events alone cannot
+tell the sensor's threshold from the contrast of the scene. But contrasts differ less between scenes than thresholds
+between sensors, and a lower threshold usually comes with a larger relative mismatch. `Scale`, a small perceptron,
+weighs these clues; the loss of DoLP trains it.
 """
 
 from typing import NamedTuple
@@ -25,6 +29,10 @@ WEIGHTS = (0.02, 3.0)  # limits of an event's weight
 OUTLIER = 2.0  # limit of a pixel's relative deviation, so that a hot pixel cannot dominate the mismatch
 SPARSE = 2  # the mismatch is estimated from every SPARSE-th pixel along each axis
 MIN_POWER = 1e-2  # lower limit of the mean squared count
+FEATURES = 6  # of Scale
+HIDDEN = 16
+MAX_LOG_SCALE = 1.5  # limit of the scale's logarithm
+MIN_FEATURE = 0.01  # added to features, in steps, before their logarithm
 
 
 class Equalised(NamedTuple):
@@ -90,3 +98,41 @@ class Equaliser(nn.Module):
 def _near(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
     """Return means over the neighbourhood of each pixel."""
     return enlarged(box_means(block_means(x, BLOCK), BLOCKS), BLOCK)
+
+
+class Scale(nn.Module):
+    """The change of log intensity per event, relative to `panorama_step`."""
+
+    given: float | None = None
+    """Known value, which replaces the estimate; None: unknown."""
+
+    def __init__(self):
+        super().__init__()
+        self.hidden = nn.Linear(FEATURES, HIDDEN)
+        self.out = nn.Linear(HIDDEN, 1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, features: Float[Tensor, "n k"]) -> Float[Tensor, "n 1 1 1"]:
+        """Return the scale of each of n images, for features from `scale_features`."""
+        if self.given is not None:
+            return features.new_full((len(features), 1, 1, 1), self.given)
+        with torch.autocast(features.device.type, enabled=False):
+            log_scale = self.out(torch.tanh(self.hidden(features)))
+            return log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE).exp()[..., None, None]
+
+
+def scale_features(
+    panorama: Float[Tensor, "n 4 h w"], total: Float[Tensor, " n"], mismatch: Float[Tensor, " n"]
+) -> Float[Tensor, "n k"]:
+    """Compute the features of `Scale` from the panorama in steps, the events per pixel so far, and the mismatch.
+
+    Logarithms of the standard deviation of the mean of the four channels and that of the two contrasts, of the mean
+    absolute slopes of both, and of the number of events; then the standard deviation of relative sensitivities.
+    """
+    parts = (panorama[:, :1], panorama[:, 1:3])
+    spreads = [part.flatten(2).var(-1).mean(1).sqrt() for part in parts]
+    steps = [[part.diff(dim=axis).abs().mean((1, 2, 3)) for axis in (-1, -2)] for part in parts]
+    slopes = [(across + down) / 2 for across, down in steps]
+    logs = [torch.log(one + MIN_FEATURE) for one in (*spreads, *slopes, total)]
+    return torch.stack([*logs, mismatch.sqrt()], dim=1)
