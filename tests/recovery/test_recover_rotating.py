@@ -9,9 +9,8 @@ from polarnet.cli import main
 from polarnet.events.streaming import WindowRule
 from polarnet.recordings.source import RecordingError
 from polarnet.recovery.inputs import half_turn_rule, rotation_of
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import resting_trajectory
-from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization

@@ -1,7 +1,6 @@
 """Properties of every pixel model: hand-worked ramps, equal bytes for any split of the work, clear errors."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -14,16 +13,9 @@ from polarnet.simulation.presets import SENSORS
 
 IDEAL = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 NOISY = dataclasses.replace(
-    IDEAL,
-    contrast_threshold_sigma_on=0.03,
-    contrast_threshold_sigma_off=0.03,
-    cutoff_hz=100.0,
-    leak_rate_hz=2.0,
-    leak_jitter=0.1,
-    noise_rate_cov_decades=0.1,
-    shot_noise_rate_hz=5.0,
-    refractory_period_us=500.0,
-)
+    IDEAL, contrast_threshold_sigma_on=0.03, contrast_threshold_sigma_off=0.03, cutoff_hz=100.0, leak_rate_hz=2.0,
+    leak_jitter=0.1, noise_rate_cov_decades=0.1, shot_noise_rate_hz=5.0, refractory_period_us=500.0,
+)  # fmt: skip
 THRESHOLD_MODELS = ["v2e", "exact", "esim"]
 
 
@@ -111,16 +103,6 @@ def test_exact_forgets_a_delayed_event_when_the_light_goes_back_in_time():
     assert events.t.tolist() == pytest.approx([2000], abs=1)
 
 
-@pytest.mark.parametrize("model", ["v2e", "exact"])
-def test_the_response_is_linear_up_to_20_dn_and_logarithmic_above(model):
-    frames = torch.tensor([0, 10, 20, 21, 255], dtype=torch.uint8).view(1, 1, 1, 5)
-    _, state = emulate(frames, torch.tensor([0]), of(model), key=1)
-    pixels = state.pixels[0]
-    response = pixels.filtered if model == "v2e" else pixels.linlog
-    expected = [0, math.log(20) / 2, math.log(20), math.log(21), math.log(255)]
-    assert response == pytest.approx(expected, abs=6e-7)
-
-
 def test_the_photoreceptor_of_exact_follows_a_step_exponentially_whatever_the_frame_rate():
     # 255 DN from 26 DN on, at 275 DN of the scale the time constant is 1 / (2 pi 10 Hz) = 15.9 ms
     def filtered(steps: int) -> float:
@@ -145,31 +127,6 @@ def test_the_photoreceptor_of_exact_follows_a_step_of_light_within_a_frame(cutof
     _, state = emulate(frames, torch.tensor([0, 20_000]), config, key=1)
     a = 2 * math.pi * cutoff_hz * 0.02 * (177.5 + 20) / 275
     assert float(state.pixels[0].change[0]) == pytest.approx(math.log(2.55) * (1 + math.expm1(-a) / a), rel=1e-5)
-
-
-def test_leak_of_a_pixel_in_steady_light_fires_on_events_at_its_rate():
-    config = of("exact", leak_rate_hz=10.0, leak_jitter=0.0)
-    frames = torch.full((2, 1, 1, 3), 90.0)
-    (events,), _ = emulate(frames, torch.tensor([0, 350_000]), config, key=1)
-    for x in range(3):  # each pixel starts with a leak of its own
-        times_us = events.t[events.x == x].numpy()
-        assert times_us[0] < 1e5 < 2.5e5 < times_us[-1]
-        assert np.diff(times_us) == pytest.approx(1e5, abs=2)
-    assert set(events.p.tolist()) == {1}
-
-
-@pytest.mark.parametrize(("dn", "fraction"), [(0.0, 1 - 0.75 * 20 / 275), (255.0, 0.25)])
-def test_shot_noise_of_a_pixel_in_steady_light_is_a_poisson_process_of_both_polarities(dn, fraction):
-    frames = torch.full((41, 1, 10, 10), dn)
-    config = of("exact", shot_noise_rate_hz=20.0)
-    (events,), _ = emulate(frames, 25_000 * torch.arange(41), config, key=1)
-    expected = 100 * 20 * fraction
-    assert len(events) == pytest.approx(expected, abs=4 * math.sqrt(expected))
-    assert int(events.p.sum()) == pytest.approx(0, abs=4 * math.sqrt(expected))
-    places = {*zip(events.y.tolist(), events.x.tolist(), strict=True)}
-    assert len(places) > 90
-    assert places <= {*itertools.product(range(10), range(10))}
-    assert int((events.t < 500_000).sum()) == pytest.approx(expected / 2, abs=4 * math.sqrt(expected / 2))
 
 
 @pytest.mark.parametrize("model", list(MODELS))
@@ -306,8 +263,8 @@ CLIP, TIMES = torch.full((3, 2, 4, 5), 100.0), torch.tensor([0, 10, 20])
         (CLIP, TIMES[:2], r"one time each .* got frames \(3, 2, 4, 5\) and 2 times"),
         (CLIP[:0], TIMES[:0], "at least one frame"),
         (CLIP.to(torch.int64), TIMES, "uint8 or float digital numbers .* got torch.int64"),
-        (CLIP / 0, TIMES, "finite frames"),
-        (-CLIP, TIMES, "negative"),
+        (CLIP / 0, TIMES, "frames: expected finite numbers, got 120 of 120"),
+        (-CLIP, TIMES, "got values down to -100"),
         (257 * CLIP, TIMES, r"expected digital numbers in \[0, 255\], got values up to 25700; scale white to 255"),
         (CLIP[0, 0, 0], TIMES, r"frames: expected \(\.\.\., channels, height, width\), got \(5,\)"),
     ],
@@ -321,16 +278,9 @@ def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
     _, state = emulate(CLIP, TIMES, IDEAL, key=1)
     with pytest.raises(ValueError, match=r"the first after the state's 20\.0"):
         emulate(CLIP, TIMES, IDEAL, key=1, state=state)
-    with pytest.raises(ValueError, match=r"the state is of channels \(0, 1\) of 4x5 pixels"):
+    with pytest.raises(ValueError, match=r"expected a state of .* 3x5 pixels, got .* channels \(0, 1\) of 4x5 pixels"):
         emulate(CLIP[:, :, :3], TIMES + 100, IDEAL, key=1, state=state)
-    with pytest.raises(ValueError, match="the state is of model exact"):
+    with pytest.raises(ValueError, match=r"expected a state of model v2e.*, got one of model exact"):
         emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)
     with pytest.raises(ValueError, match="2 different channel numbers"):
         emulate(CLIP, TIMES, IDEAL, key=1, channels=[1, 1])
-
-
-def test_numpy_frames_give_the_events_of_torch():
-    frames, t_us = moving_clip(torch.uint8), 1000 * torch.arange(12)
-    expected, _ = emulate(frames, t_us, IDEAL, key=1)
-    from_numpy, _ = emulate(frames.numpy(), t_us.numpy(), IDEAL, key=1)
-    assert all(torch.equal(a.t, b.t) for a, b in zip(from_numpy, expected, strict=True))

@@ -6,12 +6,11 @@ import pytest
 import torch
 
 from polarnet.config.tree import load
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
-from polarnet.simulation.polarizers import Grid
+from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import behind_polarizers, render_times_us
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore

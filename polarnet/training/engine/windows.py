@@ -8,7 +8,7 @@ from torch.utils.data import Dataset
 
 from polarnet.events.representations import Encode
 from polarnet.events.stream import Events
-from polarnet.events.windows import encode_windows
+from polarnet.events.streaming import encode_windows
 from polarnet.storage.frames import FrameStore
 
 
@@ -16,7 +16,7 @@ from polarnet.storage.frames import FrameStore
 class EventSource(Protocol):
     """A source of named sequences' events, read by time window: a store on disk, or an emulator.
 
-    `polarnet.storage.events.EventStore` reads stored events; `polarnet.simulation.fly.EmulatedEvents` makes them on
+    `polarnet.storage.events.EventStore` reads stored events; `polarnet.simulation.dataset.EmulatedEvents` makes them on
     request.
     """
 
