@@ -14,16 +14,12 @@ from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
+Mapper = Callable[..., Iterable[Any]]
 CAPACITY = 8  # sequences in memory, about 25 MB each at 120x180 px and 2 million events
 
 
 def emulate_scenes(
-    scenes: str | Path,
-    events: str | Path,
-    camera: Camera,
-    seed: int,
-    mapper: Callable[..., Iterable[Any]],
-    threads: int,
+    scenes: str | Path, events: str | Path, camera: Camera, seed: int, mapper: Mapper, threads: int
 ) -> int:
     """Emulate all sequences of a scene store into an event store, and return their number; both may be at a URL.
 
@@ -44,12 +40,8 @@ def emulate_scenes(
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     """All settings and data that determine the events of a scene store."""
-    return {
-        **camera.sections,
-        "seed": seed,
-        "scenes": scenes.attributes,
-        "polarnet": __version__,  # an unfinished store of another version is not resumed
-    }
+    origin = {"seed": seed, "scenes": scenes.attributes, "polarnet": __version__}  # other versions are not resumed
+    return {**camera.sections, **origin}
 
 
 def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
@@ -77,10 +69,7 @@ class EmulatedEvents:
     """
 
     def __init__(self, scenes: SceneStore, camera: Camera, seed: int, threads: int = 1, capacity: int = CAPACITY):
-        if capacity < 1:
-            raise ValueError(f"expected at least one sequence to keep in memory, got capacity={capacity}")
-        self.path = scenes.path
-        self.sequences = scenes.sequences
+        self.path, self.sequences = scenes.path, scenes.sequences
         self.height, self.width = channel_size(camera.polarizers.layout, scenes.sensor_height, scenes.sensor_width)
         self.attributes = origin_of(scenes, camera, seed)
         self._settings = scenes, camera, seed, threads, capacity
@@ -96,9 +85,6 @@ class EmulatedEvents:
 
         Raises ValueError for a sequence that the scene store does not have.
         """
-        channels = self._emulated(sequence)
-        if start_us is None and stop_us is None:
-            return list(channels)
-        start_us = start_us or 0
+        channels, start_us = self._emulated(sequence), start_us or 0
         stop_us = self._settings[0].duration_us(sequence) + 1 if stop_us is None else max(start_us, stop_us)
         return [slice_time(events, start_us, stop_us) for events in channels]

@@ -72,8 +72,6 @@ def test_a_copy_in_another_process_takes_no_events_along(source):
     assert same(pickle.loads(pickle.dumps(source)).read("a-0"), events)
 
 
-def test_an_unknown_sequence_and_an_empty_memory_are_refused(simulated, source):
+def test_an_unknown_sequence_is_refused(source):
     with pytest.raises(ValueError, match="expected a sequence of a-0, b-0, c-0, d-0; got 'lake'"):
         source.read("lake")
-    with pytest.raises(ValueError, match="at least one sequence to keep"):
-        EmulatedEvents(SceneStore.open(simulated.scenes), simulated.camera, simulated.seed, capacity=0)

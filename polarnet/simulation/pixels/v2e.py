@@ -59,16 +59,6 @@ class Firing(NamedTuple):
     candidates: np.ndarray  # int32 [2, pixels of a strip + SPARE], scratch
 
 
-class Slot(NamedTuple):
-    """One of the times in a step at which pixels may fire."""
-
-    number: int  # from 1
-    t_us: np.int64
-    stamp: np.float32  # the same time in seconds
-    least: np.float32  # seconds since the last event of a pixel, which the next must exceed
-    refractory: bool  # whether the refractory period can suppress an event of this step
-
-
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
@@ -233,34 +223,35 @@ def _emit(pixels, step, firing, n, most, columns, used):
         early = number <= most // 2
         stamp = first + interval * np.float32(number - 1) if early else last - interval * np.float32(most - number)
         columns = with_room(columns, used, active + 1)
-        slot = Slot(number, t_us, stamp, least, refractory)
-        written, active = _emit_slot(pixels, firing, active, slot, columns, used)
+        written, active = _emit_slot(pixels, firing, active, number, t_us, stamp, least, columns, used)
         used += written
     _consume(pixels, firing.entries, n)
     return columns, used
 
 
 @borrowing
-def _emit_slot(pixels, firing, active, slot, columns, used):
-    """Append the events of one slot; returns their number, and how many pixels have events left.
+def _emit_slot(pixels, firing, active, number, t_us, stamp, least, columns, used):
+    """Append the events of slot `number` (from 1) at `t_us`; returns their number, and of pixels with events left.
 
-    The columns have room for one event more than there are active pixels.
+    `stamp` is the same time in seconds. Pixels fire if it exceeds their last event's by more than `least`, -infinity if
+    the refractory period cannot suppress an event. The columns have room for one event more than active pixels.
     """
+    refractory = least >= np.float32(0)
     entries, order, since = firing.entries, firing.order, pixels.refractory_since
     t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
     written, remaining = 0, 0
     for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
         e, at = np.uint64(order[a]), np.uint64(written)
         i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
-        accepted = np.float32(slot.stamp - since[i]) > slot.least
-        if slot.refractory:
-            since[i] = slot.stamp if accepted else since[i]
+        accepted = np.float32(stamp - since[i]) > least
+        if refractory:
+            since[i] = stamp if accepted else since[i]
         polarity = np.int32(1) if crossed > 0 else np.int32(-1)
-        t[at], x[at], y[at], p[at] = slot.t_us, place & 0xFFFF, place >> 16, polarity
+        t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
         entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
         written += int(accepted)
         order[np.uint64(remaining)] = e
-        remaining += abs(crossed) > slot.number
+        remaining += abs(crossed) > number
     return written, remaining
 
 
