@@ -142,16 +142,6 @@ def test_every_angle_of_a_mosaic_is_seen_at_the_centre_of_its_cell(order):
     np.testing.assert_allclose(at_angles, expected, atol=1e-12)
 
 
-def test_an_unpolarized_edge_looks_less_polarized_than_with_one_pixel_per_angle():
-    raw = np.full((40, 40), 0.05)
-    raw[:, 21:] = 0.5  # an edge through cells
-    at_centre = scene_from_intensities(torch.from_numpy(demosaic(raw, SONY)))
-    naive = scene_from_intensities(
-        torch.from_numpy(np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]]))
-    )
-    assert dolp(at_centre.stokes).max() < 0.6 * dolp(naive.stokes).max()
-
-
 def test_what_does_not_belong_together_is_named(tmp_path):
     plane = light()[0]
     for name in ("a_0.png", "a_45.png", "a_90.png", "b_0.png", "b_45.png", "b_90.png", "b_135.png"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.events.stream import validate
+from polarnet.events.stream import concatenate, validate
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate
 from polarnet.simulation.presets import SENSORS
 
@@ -129,38 +129,27 @@ def test_the_photoreceptor_of_exact_follows_a_step_of_light_within_a_frame(cutof
     assert float(state.pixels[0].change[0]) == pytest.approx(math.log(2.55) * (1 + math.expm1(-a) / a), rel=1e-5)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1])
 @pytest.mark.parametrize("model", list(MODELS))
-def test_a_clip_cut_into_pieces_gives_the_events_of_the_whole(model):
-    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
-    whole, end = emulate(frames, t_us, of(model, NOISY), key=7)
+def test_pieces_threads_and_the_order_of_channels_change_no_event(model, share):
+    """Of valid events in the order (t, y, x, p), from sensors with and without hot and dead pixels."""
+    config = of(model, NOISY, hot_pixel_share=share, hot_pixel_rate_hz=500.0, dead_pixel_share=share)
+    frames, t_us = moving_clip(torch.float32), 3333.5 * torch.arange(12, dtype=torch.float64)
+    whole, end = emulate(frames, t_us, config, key=7)
     assert sum(map(len, whole)) > 2000
-    pieces, state = [], None
-    for piece in (slice(0, 1), slice(1, 5), slice(5, 12)):
-        events, state = emulate(frames[piece], t_us[piece], of(model, NOISY), key=7, state=state)
-        pieces.append(events)
-    for channel in range(4):
-        for name in ("t", "x", "y", "p"):
-            assert torch.equal(torch.cat([getattr(p[channel], name) for p in pieces]), getattr(whole[channel], name))
-    assert (state.t_us, state.steps) == (end.t_us, end.steps) == (11 * 3333, 11)
-
-
-@pytest.mark.parametrize("model", list(MODELS))
-def test_threads_and_the_order_of_channels_do_not_change_a_byte(model):
-    frames, t_us = moving_clip(torch.float32), 3333 * torch.arange(12)
-    alone, _ = emulate(frames, t_us, of(model, NOISY), key=7)
-    together, _ = emulate(frames, t_us, of(model, NOISY), key=7, threads=2)
-    turned, _ = emulate(frames.flip(1), t_us, of(model, NOISY), key=7, channels=[3, 2, 1, 0])
-    assert all(same(a, b) for a, b in zip(alone, together, strict=True))
-    assert all(same(a, b) for a, b in zip(alone, turned[::-1], strict=True))
-
-
-@pytest.mark.parametrize("model", list(MODELS))
-def test_events_are_valid_and_in_the_order_t_y_x_p(model):
-    events, _ = emulate(moving_clip(torch.uint8), 37.5 * torch.arange(12, dtype=torch.float64), of(model, NOISY), key=3)
-    for channel in events:
+    for channel in whole:
         validate(channel)
-        order = np.lexsort((channel.p, channel.x, channel.y, channel.t))
-        assert np.array_equal(order, np.arange(len(channel)))
+        assert np.array_equal(np.lexsort((channel.p, channel.x, channel.y, channel.t)), np.arange(len(channel)))
+    pieces, state = [], None
+    for piece in (slice(0, 1), slice(1, 5), slice(5, 6), slice(6, 12)):
+        events, state = emulate(frames[piece], t_us[piece], config, key=7, state=state)
+        pieces.append(events)
+    assert all(same(concatenate(parts), all_) for parts, all_ in zip(zip(*pieces, strict=True), whole, strict=True))
+    assert (state.t_us, state.steps) == (end.t_us, end.steps) == (11 * 3333.5, 11)
+    threaded, _ = emulate(frames, t_us, config, key=7, threads=2)
+    turned, _ = emulate(frames.flip(1), t_us, config, key=7, channels=[3, 2, 1, 0])
+    assert all(map(same, threaded, whole))
+    assert all(map(same, turned[::-1], whole))
 
 
 @pytest.mark.parametrize("model", list(MODELS))

@@ -166,23 +166,3 @@ def test_a_sensor_as_large_as_the_scene_fits_into_it(scene):
     for x, y in ((59.6, 39.5), (59.4, 39.5), (59.5, 39.6), (59.5, 39.4)):
         with pytest.raises(ValueError, match="at 7 us a sensor of 80x120 pixels reaches"):
             check_inside(scene, pose._replace(x=np.array([x]), y=np.array([y])), np.array([7]), 80, 120)
-
-
-def test_exact_needs_few_frames_for_the_times_of_many(scene):
-    config = dataclasses.replace(
-        CONFIG, contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0,
-        cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0,
-        refractory_period_us=0.0,
-    )  # fmt: skip
-    many, few = (
-        emulate_motion(Camera(dataclasses.replace(config, render_rate_hz=rate)), scene, trajectory(), 200_000, (H, W))
-        for rate in (4800.0, 300.0)
-    )
-    errors = []
-    for a, b in zip(few, many, strict=True):
-        assert len(a) == pytest.approx(len(b), rel=0.02)
-        for pixel in range(0, H * W, 7):
-            here, there = ((e.y.long() * W + e.x) == pixel for e in (a, b))
-            if torch.equal(a.p[here], b.p[there]):
-                errors.append((a.t[here] - b.t[there]).abs())
-    assert torch.cat(errors).float().mean() < 250

@@ -84,12 +84,9 @@ def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_n
     assert np.diff(adaptive).max() <= 1e6 / 72 + 1
 
 
-def test_leaving_the_scene_is_refused():
+def test_leaving_the_scene_and_a_rate_of_0_are_refused():
     with pytest.raises(ValueError, match="reaches rows"):
         still_events(SENSORS["clean"], uniform_scene(), 100_000, height=5)
-
-
-def test_a_rate_of_0_is_refused():
     with pytest.raises(ValueError, match="rate_hz: expected turns per second other than 0"):
         replace(ROTATING, rate_hz=0.0)
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from polarnet import stokes
-from polarnet.pictures.polarimetry import demosaic
 from polarnet.simulation.camera import (
     IDEAL,
     PolarizersConfig,
@@ -21,7 +20,6 @@ from polarnet.simulation.motion import Pose, Sine, render_poses
 from polarnet.simulation.moving_sensor import channel_light, lights_of_drift
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.stokes import parse_mosaic
 
 FILM = dataclasses.replace(IDEAL, extinction_ratio=[100.0] * 4)
 DOFP = dataclasses.replace(IDEAL, layout="dofp")
@@ -120,27 +118,6 @@ def test_each_channel_of_a_mosaic_sees_its_own_pixels():
     for channel, (row, column) in zip(channels, [(1, 1), (0, 1), (0, 0), (1, 0)], strict=True):
         expected = 0.0005 * (100 * rows + columns)[row::2, column::2]
         torch.testing.assert_close(channel, expected.double(), atol=1e-6, rtol=0)
-
-
-def test_a_mosaic_demosaicked_gives_the_dolp_of_a_scene_that_changes_evenly():
-    """S0 rises along the columns, DoLP along the rows; bilinear interpolation to the centres of cells is then exact.
-
-    Without it, an unpolarized scene would look polarized: S0 changes by 2 % from one pixel of a cell to the next.
-    """
-    rows, columns = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
-    for slope, degree in ((0.01, 0.0), (0.01, 0.02), (-0.01, 0.02)):
-        s0 = 0.5 + slope * (columns - 30)
-        scene = scene_from_polarization(s0, degree * rows, math.radians(40) * torch.ones(40, 60))
-        cells = channels_of(scene, DOFP, still(29.5, 19.5), (40, 60))
-        raw = np.empty((40, 60))
-        for cell, (row, column) in zip(cells.numpy(), [(1, 1), (0, 1), (0, 0), (1, 0)], strict=True):
-            raw[row::2, column::2] = cell
-        centres = degree * (rows[2:-2:2, 2:-2:2].double() + 0.5)
-        interpolated = torch.from_numpy(demosaic(raw, parse_mosaic(DOFP.mosaic)))
-        dolp = stokes.dolp(stokes.stokes_from_intensities(interpolated))
-        torch.testing.assert_close(dolp, centres, atol=1e-5, rtol=0)
-        without = stokes.dolp(stokes.stokes_from_intensities(cells))[1:-1, 1:-1]
-        assert float((without - centres).abs().max()) > 0.01
 
 
 def test_crosstalk_brings_a_fifth_of_the_light_from_four_neighbours():
