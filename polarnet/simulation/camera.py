@@ -119,8 +119,10 @@ class Camera:
 
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""
-        sections = [replace(s, **draws(s, seed, sequence), randomise=None) for s in self._sections.values()]
-        return Camera(*sections, seed_for(seed, sequence, purpose))
+        sensor, polarizers, readout = (
+            replace(section, **draws(section, seed, sequence), randomise=None) for section in self._sections.values()
+        )
+        return Camera(sensor, polarizers, readout, seed_for(seed, sequence, purpose))
 
     @property
     def _sections(self) -> dict[str, Any]:

@@ -233,8 +233,8 @@ def _placed(
     x_sines, y_sines = (tuple(Sine(*sine) for sine in axis) for axis in sines)
     roll = generator.uniform(0, math.radians(config.rotation_max_deg))
     zoom = generator.uniform(0, (config.zoom_max - 1) / 2)
-    turns = [_turn(roll, 2.0, config, speed, generator), _turn(zoom, 3.0, config, speed, generator)]
-    return Trajectory(float(x), float(y), x_sines, y_sines, *turns, speed_px_s=speed)
+    rolls, zooms = _turn(roll, 2.0, config, speed, generator), _turn(zoom, 3.0, config, speed, generator)
+    return Trajectory(float(x), float(y), x_sines, y_sines, rolls, zooms, speed)
 
 
 def _drift_share(config: SynthesizeConfig) -> float:

@@ -175,7 +175,8 @@ def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Scene:
     polarization, valid = _read_polarization(synthesis.images, picture)
     if synthesis.variation and scene != picture:
         polarization = varied(polarization, synthesis.variation, generator_for(synthesis.seed, scene, "variation"))
-    return as_stored(Scene(*polarization, valid))
+    s0, dolp, aolp = polarization
+    return as_stored(Scene(s0, dolp, aolp, valid))
 
 
 def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:

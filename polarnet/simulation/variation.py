@@ -66,7 +66,8 @@ def varied(
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
     if generator.random() < config.uniform_share:  # the weighted mean of the scene's (s1, s2) and a constant
-        share = generator.uniform(*config.uniform_weight)
+        lightest, heaviest = config.uniform_weight
+        share = generator.uniform(lightest, heaviest)
         degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
         mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
         mean[1] += share * degree * math.cos(2 * angle)
