@@ -23,15 +23,12 @@ from polarnet.methods.stokes_gain import consistent
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.reports.overview import OFF, ON
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_out, weights_of
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
-from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.moving_sensor import channel_light, emulate_motion
 from polarnet.simulation.pixels.light import KNEE, linlog
-from polarnet.simulation.polarizers import PolarizersConfig, weights_of
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
-from polarnet.simulation.readout import PERFECT, read_out
-from polarnet.simulation.rendering import channel_light
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import (
     POLARIZER_ANGLES_DEG,

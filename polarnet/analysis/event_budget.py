@@ -25,8 +25,7 @@ from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events, slice_count, slice_time
-from polarnet.events.streaming import EventWindow
-from polarnet.events.windows import BIN_EDGES, events_per_pixel
+from polarnet.events.streaming import BIN_EDGES, EventWindow, events_per_pixel
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import Recoverer
 from polarnet.metrics.similarity import correlation, mse, psnr

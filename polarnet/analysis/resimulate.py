@@ -10,10 +10,9 @@ from torch import Tensor
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, grid
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.storage.events import EventStore

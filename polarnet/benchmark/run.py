@@ -10,7 +10,7 @@ from polarnet.benchmark.rows import Context, predictions_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_sequence, scored_windows
 from polarnet.benchmark.sequences import BenchmarkSet, TestSequence
 from polarnet.events.representations import event_tensor, polarity_sums
-from polarnet.events.windows import encode_windows
+from polarnet.events.streaming import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.streaming import EventWindow
-from polarnet.events.windows import windows_of
+from polarnet.events.streaming import EventWindow, windows_of
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 

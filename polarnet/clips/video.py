@@ -12,12 +12,16 @@ from torch import Tensor
 from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, one_thread
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, grid, weights_of
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate_frames
 from polarnet.simulation.motion import SynthesizeConfig, frame_times_us, random_trajectory, render
-from polarnet.simulation.moving_sensor import channels_of, emulate_motion_steps, leave_sensors
-from polarnet.simulation.polarizers import grid, weights_of
-from polarnet.simulation.rendering import channel_light, render_times_us
+from polarnet.simulation.moving_sensor import (
+    channel_light,
+    channels_of,
+    emulate_motion_steps,
+    leave_sensors,
+    render_times_us,
+)
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
 

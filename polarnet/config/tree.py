@@ -30,11 +30,9 @@ from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, PolarizersConfig, ReadoutConfig, channel_size
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.polarizers import PolarizersConfig, channel_size
-from polarnet.simulation.readout import ReadoutConfig
 from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig

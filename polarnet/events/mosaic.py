@@ -18,10 +18,8 @@ def places_of(mosaic: Mosaic) -> list[tuple[int, int]]:
 def split_mosaic(events: Events, mosaic: Mosaic) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, of a sensor with polarizers on its pixels.
 
-    Each channel has half of the sensor's rows and columns. Its pixel for a 2x2 cell fires when that angle's pixel in
-    the cell does. Events keep their times, and none is added; only those of an odd last row or column are left out. The
-    four pixels of a cell look at places half a cell apart, so an edge crosses them one after the other. ValueError for
-    a sensor without a whole cell.
+    Each channel has half of the sensor's rows and columns: its pixel for a 2x2 cell fires when that angle's pixel in
+    the cell does. Events of an odd last row or column are left out. ValueError for a sensor without a whole cell.
     """
     height, width = events.height // 2, events.width // 2
     if not (height and width):

@@ -1,4 +1,4 @@
-"""Encode events as dense network input. Encodings that weight time state where the first and last event lie in it."""
+"""Encode events as dense network input."""
 
 from collections.abc import Callable
 
@@ -16,11 +16,10 @@ Encode = Callable[[Events, int], Tensor]
 def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     """Polarities summed per pixel, each weighted by its time since the first event (paper Eq. 5).
 
-    Time counts from the first event of this channel in the window, in window lengths. The first event weighs 0. An
-    event at the very end weighs less than 1, or 1 if the first came as the window opened. ValueError for a window
-    without a length.
+    Time counts from the first event of this channel in the window, in window lengths; ValueError for none.
     """
-    _check_length(window_us)
+    if window_us <= 0:
+        raise ValueError(f"expected a window longer than 0 us, got {window_us}")
     elapsed = (events.t - events.t[:1]) / window_us
     image = elapsed.new_zeros(events.height * events.width).index_add_(0, _pixel(events), events.p * elapsed)
     return image.view(events.height, events.width)
@@ -55,10 +54,7 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
 
 
 def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h w"]:
-    """Nonzero entries normalised to mean 0 and standard deviation 1, grid by grid, as in E2VID.
-
-    Zeros stay zero. Entries that are all equal become 0, not infinite.
-    """
+    """Nonzero entries normalised to mean 0 and standard deviation 1, grid by grid, as in E2VID; equal ones to 0."""
     filled = grids != 0
     over = (-3, -2, -1)
     count = filled.sum(over, keepdim=True).clamp(min=1)
@@ -67,33 +63,11 @@ def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h
     return centred / torch.where(deviation > 0, deviation, 1.0)
 
 
-def time_surface(events: Events, window_us: int) -> Float[Tensor, "h w"]:
-    """Polarity of each pixel's last event, decayed by its age: p exp(-(t_last - t) / window) (Lagorce et al. 2017).
-
-    Ages count back from the last event of the channel, which therefore weighs 1. Pixels without an event are 0.
-    ValueError for a window without a length.
-    """
-    _check_length(window_us)
-    size = events.height * events.width
-    number = torch.arange(1, len(events) + 1, device=events.t.device)
-    latest = number.new_zeros(size).scatter_reduce_(0, _pixel(events), number, "amax")  # 0: no event
-    fired = latest > 0
-    last = latest[fired] - 1
-    surface = torch.zeros(size, device=events.t.device)
-    surface[fired] = events.p[last] * torch.exp((events.t[last] - events.t[-1:]) / window_us)
-    return surface.view(events.height, events.width)
-
-
 def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
-    """Per pixel, the sum of polarities and the number of events.
-
-    The sum is the change of log intensity in contrast thresholds.
-    """
-    pixel = _pixel(events)
-    images = torch.zeros(2, events.height * events.width, device=events.t.device)
-    images[0].index_add_(0, pixel, events.p.float())
-    images[1].index_add_(0, pixel, torch.ones_like(pixel, dtype=images.dtype))
-    return images.view(2, events.height, events.width)
+    """Per pixel, the sum of polarities (change of log intensity in contrast thresholds) and the number of events."""
+    counts = torch.zeros(events.height * events.width, device=events.p.device)
+    counts.index_add_(0, _pixel(events), torch.ones_like(events.p, dtype=counts.dtype))
+    return torch.stack([polarity_sums(events), counts.view(events.height, events.width)])
 
 
 def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
@@ -105,7 +79,6 @@ REPRESENTATIONS: dict[str, Encode] = {
     "event_tensor": event_tensor,
     "event_counts": event_counts,
     "voxel_grid": voxel_grid_of_window,
-    "time_surface": time_surface,
 }
 """Encoders by name: (events of one channel, window length in microseconds) -> one image or a stack."""
 
@@ -114,11 +87,6 @@ def channels_of(encode: Encode) -> int:
     """Number of images that a representation makes of one channel's events."""
     shape = encode(Events.empty(1, 1), 1).shape
     return shape[0] if len(shape) == 3 else 1
-
-
-def _check_length(window_us: int) -> None:
-    if window_us <= 0:
-        raise ValueError(f"expected a window longer than 0 us, got {window_us}")
 
 
 def _pixel(events: Events) -> Int64[Tensor, " n"]:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-MIN_TRIGGERS = 2
-
 
 @dataclass(frozen=True, eq=False)  # arrays have no single answer to ==
 class Rotation:
@@ -19,7 +17,7 @@ class Rotation:
     """Radians, unwrapped: a full turn adds 2 pi."""
 
     def __post_init__(self):
-        if self.times_us.shape != self.angles.shape or len(self.times_us) < MIN_TRIGGERS:
+        if self.times_us.shape != self.angles.shape or len(self.times_us) < 2:
             raise ValueError(f"rotation: expected at least two times with one angle each, got {self.times_us.shape}")
         if not (np.isfinite(self.times_us).all() and (np.diff(self.times_us) > 0).all()):
             raise ValueError(f"rotation: expected increasing times, got {self.times_us[:5].tolist()}... us")
@@ -53,16 +51,15 @@ def steady_rotation(rate_hz: float, start_angle: float = 0.0) -> Rotation:
     """Rotation at `rate_hz` turns per second from `start_angle` (radians) at time 0; ValueError for a rate of 0."""
     if not (math.isfinite(rate_hz) and rate_hz):
         raise ValueError(f"rotation: expected a rate in turns per second other than 0, got {rate_hz}")
-    return Rotation(
-        np.array([0.0, 1e6 / abs(rate_hz)]), start_angle + np.array([0.0, math.copysign(2 * math.pi, rate_hz)])
-    )
+    turn = math.copysign(2 * math.pi, rate_hz)
+    return Rotation(np.array([0.0, 1e6 / abs(rate_hz)]), start_angle + np.array([0.0, turn]))
 
 
 def triggered_rotation(
     trigger_us: Int64[np.ndarray, " n"], start_angle: float = 0.0, turns_per_trigger: float = 1.0
 ) -> Rotation:
     """Rotation from `start_angle` (radians) at the first trigger, by `turns_per_trigger` to each next trigger."""
-    if len(trigger_us) < MIN_TRIGGERS:
+    if len(trigger_us) < 2:
         raise ValueError(f"rotation: expected at least two trigger times, got {len(trigger_us)}; give the rate instead")
     turns = turns_per_trigger * np.arange(len(trigger_us))
     return Rotation(trigger_us.astype(np.float64), start_angle + 2 * math.pi * turns)

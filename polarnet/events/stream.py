@@ -15,6 +15,7 @@ from polarnet.runtime.arrays import Array, whole_numbers
 
 MAX_SIDE = 2**15 - 1  # pixels; coordinates are int16
 
+Column = Integer[Array, " n"]
 _COLUMNS = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "p": torch.int8}
 
 
@@ -53,28 +54,18 @@ class Events:
         return len(self.t)
 
     @classmethod
-    def from_columns(
-        cls,
-        t: Integer[Array, " n"],
-        x: Integer[Array, " n"],
-        y: Integer[Array, " n"],
-        p: Integer[Array, " n"],
-        height: int,
-        width: int,
-    ) -> "Events":
+    def from_columns(cls, t: Column, x: Column, y: Column, p: Column, height: int, width: int) -> "Events":
         """Events from numpy or torch columns of any integer type: microseconds, column, row, and +1 or -1.
 
-        Every event is checked. TypeError for anything but an array; ValueError for floats, columns of different
-        lengths, and invalid events (see `validate`).
+        TypeError for anything but an array; ValueError for floats, columns of different lengths, and events that
+        `validate` refuses.
         """
         columns = {}
         for (name, dtype), values in zip(_COLUMNS.items(), (t, x, y, p), strict=True):
             wide = whole_numbers(name, values)
             columns[name] = wide.to(dtype)
             if not torch.equal(columns[name].long(), wide):
-                raise ValueError(
-                    f"events: expected {name} that fit {dtype}, got {int(wide.min())} to {int(wide.max())}"
-                )
+                raise ValueError(f"events: expected {name} that fit {dtype}, got {wide.min()} to {wide.max()}")
         return validate(cls(**columns, height=height, width=width))
 
     @classmethod
@@ -85,10 +76,7 @@ class Events:
 
 
 def validate(events: Events) -> Events:
-    """Return `events` unchanged if all are in time order, on the sensor and of polarity +1 or -1.
-
-    ValueError names the first invalid event.
-    """
+    """`events` if all are in time order, on the sensor and of polarity +1 or -1; else ValueError naming the first."""
     if _all_valid(*(getattr(events, name).numpy() for name in _COLUMNS), events.height, events.width):
         return events
     in_time_order = torch.ones(len(events), dtype=torch.bool)
@@ -138,10 +126,8 @@ def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
     """Events in a part of the sensor, in coordinates from the part's corner; ValueError if it exceeds the sensor."""
     if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):
-        raise ValueError(
-            f"crop: rows {top} to {top + height} and columns {left} to {left + width} are not on a sensor of "
-            f"{events.height}x{events.width} px"
-        )
+        part = f"rows {top} to {top + height} and columns {left} to {left + width}"
+        raise ValueError(f"crop: {part} are not on a sensor of {events.height}x{events.width} px")
     inside = (events.y >= top) & (events.y < top + height) & (events.x >= left) & (events.x < left + width)
     cut = select(events, inside)
     return replace(cut, x=cut.x - left, y=cut.y - top, height=height, width=width)
@@ -150,11 +136,9 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
 def downscale(events: Events, height: int, width: int, *, keep_rate: bool) -> Events:
     """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
 
-    `keep_rate` is the event-rate rule. False keeps every event: a coarse pixel fires as often as all its fine pixels
-    together, as if its contrast threshold were divided by their number. True gives the events of one pixel with the
-    same threshold. A coarse pixel then fires each time the polarity sum of its fine pixels moves by their mean number,
-    H W / (height width), which is one threshold of their mean log intensity. ValueError where the new size is larger
-    than the old.
+    `keep_rate` False keeps every event, as if a coarse pixel's threshold were divided by the number of its fine pixels.
+    True gives the events of one pixel with the same threshold: it fires each time the polarity sum of its fine pixels
+    moves by their mean number, H W / (height width). ValueError for a larger size.
     """
     if not (0 < height <= events.height and 0 < width <= events.width):
         raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
@@ -173,18 +157,13 @@ def concatenate(parts: Sequence[Events]) -> Events:
     filled = [part for part in parts if len(part)]
     for i, (before, after) in enumerate(itertools.pairwise(filled), start=1):
         if after.t[0] < before.t[-1]:
-            raise ValueError(
-                f"concatenate: piece {i} starts at {int(after.t[0])} us, before the end of the piece ahead of it at "
-                f"{int(before.t[-1])} us; merge() sorts streams that overlap"
-            )
+            times = f"piece {i} starts at {after.t[0]} us, before the end of the piece ahead of it at {before.t[-1]} us"
+            raise ValueError(f"concatenate: {times}; merge() sorts streams that overlap")
     return _joined(parts)
 
 
 def merge(streams: Sequence[Events]) -> Events:
-    """Merge streams of one sensor, which may overlap in time.
-
-    At equal times, the earlier stream's events come first.
-    """
+    """Merge streams of one sensor; at equal times, the earlier stream's events come first."""
     joined = _joined(streams)
     return select(joined, torch.sort(joined.t, stable=True).indices)
 

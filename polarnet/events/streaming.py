@@ -1,22 +1,27 @@
-"""Cut a stream of events into windows as it arrives: by time or by number of events, consecutive or overlapping.
+"""Windows of events: those between the frames of a sequence, and those cut from a stream as it arrives."""
 
-`WindowCutter` accepts events all at once or in pieces.
-"""
-
+import itertools
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Int64, Integer
+from torch import Tensor
 
+from polarnet.events.representations import Encode
 from polarnet.events.stream import Events, concatenate, slice_count
+from polarnet.runtime.arrays import Array, whole_numbers
 
 SHORTEST_STEP_US = 100
 MAX_PAUSE_US = 3_600_000_000
 """Longest accepted time without an event; a longer one comes from a damaged time stamp and gives endless windows."""
 TRAINED_WINDOW_US = 33_333
 """Window length in the training of the networks, 1/30 s."""
+BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
+"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
 
 
 class EventWindow(NamedTuple):
@@ -58,29 +63,25 @@ class WindowRule:
             if self.step_us < SHORTEST_STEP_US:
                 raise ValueError(f"expected a step of at least {SHORTEST_STEP_US / 1000} ms, got {self.step_us} us")
             if self.length_us is not None and self.step_us > self.length_us:
-                raise ValueError(
-                    f"expected a step no longer than the windows of {self.length_us} us, got {self.step_us} us: "
-                    f"events between windows would be lost"
-                )
+                expected = f"a step no longer than the windows of {self.length_us} us"
+                raise ValueError(f"expected {expected}, got {self.step_us} us: events between windows would be lost")
 
 
 def parse_window(text: str) -> tuple[int | None, int | None]:
     """Parse "33.3ms" to (microseconds, None), or "20000ev" to (None, number); ValueError for anything else."""
-    match = re.fullmatch(r"(?P<number>\d+(\.\d*)?|\.\d+)\s*(?P<unit>us|ms|s|ev|events)", text.strip())
-    if match is None or (match["unit"] in ("ev", "events") and not match["number"].isdigit()):
-        raise ValueError(f"expected a time such as 33.3ms or a number of events such as 20000ev, got {text!r}")
-    if match["unit"] in ("ev", "events"):
-        return None, int(match["number"])
-    return round(float(match["number"]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match["unit"]]), None
+    if match := re.fullmatch(r"(\d+)\s*ev(ents)?", text.strip()):
+        return None, int(match[1])
+    if match := re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(us|ms|s)", text.strip()):
+        return round(float(match[1]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match[2]]), None
+    raise ValueError(f"expected a time such as 33.3ms or a number of events such as 20000ev, got {text!r}")
 
 
 class WindowCutter:
     """Cuts a stream that arrives in pieces into windows, each as soon as all of its events are known.
 
-    Windows by time end after one whole length, and then every step (or length); each starts one length before its end.
-    Windows by number end with their last event and start at the previous window's end. With a step, a window by number
-    holds the last `events` events before each multiple of the step, and starts with the first of them. Events that no
-    later window needs are dropped. Times count from 0.
+    Windows by time end after one whole length, and then every step (or length). Windows by number end with their last
+    event and start at the previous window's end; with a step, each holds the last `events` events before a multiple of
+    the step, and starts with the first of them. Times count from 0.
     """
 
     def __init__(self, rule: WindowRule, height: int, width: int, channels: int = 4):
@@ -114,10 +115,10 @@ class WindowCutter:
         times = torch.cat([torch.tensor([start_us, until_us]), *(one.t for one in channels)]).sort().values
         pauses = times.diff()
         if int(pauses.max()) > MAX_PAUSE_US:
-            before = int(pauses.argmax())
+            start_us, stop_us = times[pauses.argmax() :][:2].tolist()
             raise ValueError(
                 f"expected events without a pause longer than {MAX_PAUSE_US // 1_000_000} s, got none between "
-                f"{int(times[before])} and {int(times[before + 1])} us: a damaged time stamp? cut the recording there"
+                f"{start_us} and {stop_us} us: a damaged time stamp? cut the recording there"
             )
 
     def _by_time(self, length_us: int, until_us: int) -> Iterator[EventWindow]:
@@ -162,3 +163,33 @@ class WindowCutter:
 
     def _forget(self, places: Sequence[int]) -> None:
         self._held = [slice_count(held, place, len(held)) for held, place in zip(self._held, places, strict=True)]
+
+
+def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
+    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
+    return (counts / (events[0].height * events[0].width)).float()
+
+
+def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:
+    """(start, stop) of the windows between consecutive frame times: one fewer than there are frames."""
+    return list(itertools.pairwise(t_us.tolist()))
+
+
+def cut_windows(events: Events, t_us: Int64[Tensor, " n"]) -> list[Events]:
+    """The events of each window of `windows_of`, half-open: start <= t < stop."""
+    return [slice_count(events, start, stop) for start, stop in windows_of(torch.searchsorted(events.t, t_us))]
+
+
+def encode_windows(channels: Sequence[Events], t_us: Integer[Array, " n"], encode: Encode) -> Float[Tensor, "t c h w"]:
+    """Encode every window between consecutive times `t_us`; the second axis holds the channels one after the other.
+
+    ValueError for fewer than two frame times, which leave no window, and for times that do not increase.
+    """
+    t_us = whole_numbers("t_us", t_us)
+    if t_us.ndim != 1 or len(t_us) < 2 or (t_us.diff() <= 0).any():
+        raise ValueError(f"expected at least two frame times, each later than the last, got {t_us.tolist()}")
+    lengths = t_us.diff().tolist()
+    per_channel = [torch.stack(list(map(encode, cut_windows(events, t_us), lengths))) for events in channels]
+    height, width = per_channel[0].shape[-2:]
+    return torch.cat([images.view(len(lengths), -1, height, width) for images in per_channel], dim=1)

@@ -11,25 +11,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from polarnet.pictures.images import (
-    UnreadablePicture,
-    code_fractions,
-    extension,
-    fit,
-    picture_extensions,
-    read_channels,
-    read_picture,
-    srgb_of,
-)
-from polarnet.pictures.polarimetry import (
-    ANGLE_SUFFIX,
-    MIN_MOSAIC_SIDE,
-    group_by_measurement,
-    levels_at_angles,
-    read_levels,
-    white_level,
-    without_saturation,
-)
+from polarnet.pictures import images, polarimetry
+from polarnet.pictures.images import UnreadablePicture, code_fractions, extension
+from polarnet.pictures.polarimetry import ANGLE_SUFFIX, MIN_MOSAIC_SIDE
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 VIDEOS = frozenset(["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "gif"])
@@ -81,9 +65,9 @@ def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
     """Open a video, a folder of frames, four videos behind polarizers, or the picture of a single frame.
 
     A folder whose files are all NAME_0, NAME_45, NAME_90, NAME_135 or .npz holds measured polarization; with a
-    `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the numbers in their names. Raises
-    FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong together; iterating
-    raises it for later frames.
+    `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the numbers in their names.
+    FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong together, on iterating
+    for later frames.
     """
     missing = [str(path) for path in paths if not path.exists()]
     if missing:
@@ -117,25 +101,25 @@ class _Files:
 
 
 def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
-    kinds = picture_extensions() | {"npz"}
+    kinds = images.picture_extensions() | {"npz"}
     visible = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     files = sorted((path for path in visible if extension(path) in kinds), key=_in_order)
     if not files:
         raise UnreadablePicture(f"{folder}: expected the pictures of a clip, found none; videos are given as files")
     measured = all(extension(file) == "npz" or ANGLE_SUFFIX.fullmatch(file.stem) for file in files)
-    if options.mosaic is None and measured:
-        return _open_files(group_by_measurement(files), name, options)
-    return _open_files([(file,) for file in files], name, options)
+    grouped = options.mosaic is None and measured
+    return _open_files(
+        polarimetry.group_by_measurement(files) if grouped else [(file,) for file in files], name, options
+    )
 
 
 def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
-    first = groups[0][0]
-    measured = extension(first) == "npz" or len(groups[0]) > 1
+    measured = extension(groups[0][0]) == "npz" or len(groups[0]) > 1
     if not measured and options.mosaic is None:
         kind = "photograph" if len(groups) == 1 else "frames"
         return _coloured(name, kind, _from_files(groups, _rgb), options)
-
-    return _measured(name, "four polarizers" if measured else "raw mosaics", _from_files(groups, read_levels), options)
+    kind = "four polarizers" if measured else "raw mosaics"
+    return _measured(name, kind, _from_files(groups, polarimetry.read_levels), options)
 
 
 def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, ...]], Levels]) -> _Files:
@@ -152,11 +136,11 @@ def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, 
 def _rgb(paths: tuple[Path, ...]) -> Float32[np.ndarray, "3 h w"]:
     """sRGB code values; a picture with one channel is grey."""
     (path,) = paths
-    channels = read_channels(path)
+    channels = images.read_channels(path)
     if channels.shape[2] == 1:
         return np.repeat(code_fractions(channels).transpose(2, 0, 1), 3, axis=0)
-    picture = read_picture(path)
-    return srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
+    picture = images.read_picture(path)
+    return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 
 def _from_videos(paths: Sequence[Path], colour: bool = False) -> _Files:
@@ -175,29 +159,24 @@ def _from_videos(paths: Sequence[Path], colour: bool = False) -> _Files:
                 if len(ended) == len(paths):
                     break
                 if ended:
-                    raise UnreadablePicture(
-                        f"{', '.join(ended)} ends after {number} frames, before the others; cut all to one length"
-                    )
+                    names = ", ".join(ended)
+                    raise UnreadablePicture(f"{names} ends after {number} frames, before the others; cut all alike")
                 planes = [_checked(path, pixels) for path, (_, pixels) in zip(paths, read, strict=True)]
                 t_us = 1000 * opened[0].get(cv2.CAP_PROP_POS_MSEC)
                 if colour:
-                    rgb = planes[0][..., ::-1].transpose(2, 0, 1)
-                    yield f"frame {number}", rgb.astype(np.float32) / np.float32(255), t_us
-                else:
-                    green = [plane[..., GREEN] for plane in planes]
-                    if len({plane.shape for plane in green}) > 1:
-                        sizes = ", ".join(
-                            f"{path.name} {plane.shape}" for path, plane in zip(paths, green, strict=True)
-                        )
-                        raise UnreadablePicture(f"expected four videos of one size, got {sizes}")
-                    yield f"frame {number}", np.stack(green), t_us
+                    yield f"frame {number}", code_fractions(planes[0][..., ::-1].transpose(2, 0, 1)), t_us
+                    continue
+                if len({plane.shape for plane in planes}) > 1:
+                    sizes = ", ".join(
+                        f"{path.name} {plane.shape[:2]}" for path, plane in zip(paths, planes, strict=True)
+                    )
+                    raise UnreadablePicture(f"expected four videos of one size, got {sizes}")
+                yield f"frame {number}", np.stack([plane[..., GREEN] for plane in planes]), t_us
         finally:
             for capture in opened:
                 capture.release()
         if number == 0:
-            raise UnreadablePicture(
-                f"{paths[0].name}: it has no frame that can be read; convert it to MP4 or PNG files"
-            )
+            raise UnreadablePicture(f"{paths[0].name}: no frame of it can be read; convert it to MP4 or PNG files")
 
     return _Files(min(stated) or None, False, levels)
 
@@ -205,9 +184,7 @@ def _from_videos(paths: Sequence[Path], colour: bool = False) -> _Files:
 def _capture(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():
-        raise UnreadablePicture(
-            f"{path.name}: OpenCV cannot open it as a video; convert it to MP4, or to a folder of PNG"
-        )
+        raise UnreadablePicture(f"{path.name}: OpenCV cannot open it as a video; convert it to MP4 or a folder of PNG")
     return capture
 
 
@@ -245,28 +222,23 @@ def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Cli
     def frames() -> Iterator[ClipFrame]:
         white = options.white
         for number, (levels, t_us) in enumerate(_of_one_size(files)):
-            white = white_level(levels) if white is None else white
+            white = polarimetry.white_level(levels) if white is None else white
             if levels.max() > white:
                 raise UnreadablePicture(
                     f"frame {number}: expected levels up to {white:g}, those of the first frame's bits, got "
                     f"{levels.max():g}; give --white, the level at which the camera saturates"
                 )
-            _check_cells(levels)
-            values, saturated = levels_at_angles(levels, white, options.mosaic)
-            pixels = without_saturation(values, saturated).astype(np.float32).transpose(1, 2, 0)
+            height, width = levels.shape[1:]
+            if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
+                raise UnreadablePicture(
+                    f"--mosaic: expected frames of even height and width, {MIN_MOSAIC_SIDE} px or more, for whole 2x2 "
+                    f"cells, got {height}x{width}; cut them without shifting the cells"
+                )
+            values, saturated = polarimetry.levels_at_angles(levels, white, options.mosaic)
+            pixels = polarimetry.without_saturation(values, saturated).astype(np.float32).transpose(1, 2, 0)
             yield ClipFrame(_scaled(np.ascontiguousarray(pixels), options.size), t_us, float(saturated.any(0).mean()))
 
     return Clip(name, words, True, files.count, files.still, frames)
-
-
-def _check_cells(levels: Levels) -> None:
-    """UnreadablePicture for a raw frame that cannot hold whole cells."""
-    height, width = levels.shape[1:]
-    if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
-        raise UnreadablePicture(
-            f"--mosaic: expected frames of even height and width, {MIN_MOSAIC_SIDE} px or more, for whole 2x2 cells, "
-            f"got {height}x{width}; cut them without shifting the cells"
-        )
 
 
 def _of_one_size(files: _Files) -> Iterator[tuple[Levels, float | None]]:
@@ -284,10 +256,9 @@ def _scaled(pixels: Float32[np.ndarray, "h w c"], size: Size | None) -> Float32[
     if size is None:
         return pixels
     if size[0] > pixels.shape[0] or size[1] > pixels.shape[1]:
-        raise UnreadablePicture(
-            f"--size: expected at most the frames' {pixels.shape[0]} {pixels.shape[1]}, got {size[0]} {size[1]}"
-        )
-    return fit(pixels, *size, max_upscale=1.0)
+        height, width, _ = pixels.shape
+        raise UnreadablePicture(f"--size: expected at most the frames' {height} {width}, got {size[0]} {size[1]}")
+    return images.fit(pixels, *size, max_upscale=1.0)
 
 
 def _in_order(path: Path) -> list[tuple[int, str]]:
@@ -297,10 +268,7 @@ def _in_order(path: Path) -> list[tuple[int, str]]:
 
 
 def times_from_file(path: Path, unit: str) -> Float64[np.ndarray, " n"]:
-    """Times in microseconds from a text with one a line, in `unit` (us, ms or s).
-
-    Further words of a line, and lines that start with #, are ignored. ValueError for anything else.
-    """
+    """Times in microseconds from a text with one a line, in `unit` (us, ms or s); further words and # are ignored."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file; write the time of each frame on a line of its own")
     times = []

@@ -1,8 +1,7 @@
 """Dead leaves: generated pictures with the statistics of photographs.
 
 Opaque shapes of power-law size that occlude each other give the edges, the scale invariance and the 1/f^2 spectrum of
-natural pictures (Lee, Mumford and Huang, "Occlusion models for natural images", 2001). Colours spread wide over hue,
-saturation and value, so that the scenes made of them cover all angles and degrees of polarization.
+natural pictures (Lee, Mumford and Huang, "Occlusion models for natural images", 2001).
 """
 
 import math
@@ -167,10 +166,11 @@ def _paint(
                 cover = min(1.0, 0.5 - _outside_px(leaf, dx, dy))
                 if cover <= 0:
                     continue
-                red, green, blue = _colour(leaf, dx, dy, noise)
-                picture[row, column, 0] += visible * cover * red
-                picture[row, column, 1] += visible * cover * green
-                picture[row, column, 2] += visible * cover * blue
+                hue, saturation, value = _colour(leaf, dx, dy, noise)
+                for channel, offset in enumerate((5.0, 3.0, 1.0)):  # red, green and blue of a colour in HSV
+                    k = (offset + 6 * hue) % 6
+                    rgb = value * (1 - saturation * max(0.0, min(1.0, min(k, 4 - k))))
+                    picture[row, column, channel] += visible * cover * rgb
                 uncovered[row, column] = visible - visible * cover if visible * (1 - cover) > HIDDEN else 0
 
 
@@ -194,7 +194,7 @@ def _outside_px(leaf, dx: float, dy: float) -> float:
 @no_type_check
 @numba.njit(cache=True, nogil=True, inline="always")
 def _colour(leaf, dx: float, dy: float, noise) -> tuple[float, float, float]:
-    """RGB of a leaf at a point: its colour, shaded along one axis, plus its texture."""
+    """Hue in turns, saturation and value of a leaf at a point: its colour, shaded along one axis, plus its texture."""
     shade = (leaf.shade_cos * dx + leaf.shade_sin * dy) / leaf.radius
     pattern = 0.0
     if leaf.texture == GRATING:
@@ -204,19 +204,7 @@ def _colour(leaf, dx: float, dy: float, noise) -> tuple[float, float, float]:
     hue = leaf.hsv[0] + leaf.slope[0] * shade + leaf.depth[0] * pattern
     saturation = min(1.0, max(0.0, leaf.hsv[1] + leaf.slope[1] * shade + leaf.depth[1] * pattern))
     value = min(1.0, max(0.0, leaf.hsv[2] * (1 + 2 * leaf.slope[2] * shade + 2 * leaf.depth[2] * pattern)))
-    return (
-        _channel(hue, saturation, value, 5.0),
-        _channel(hue, saturation, value, 3.0),
-        _channel(hue, saturation, value, 1.0),
-    )
-
-
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _channel(hue: float, saturation: float, value: float, offset: float) -> float:
-    """Red (offset 5), green (3) or blue (1) of a colour in HSV; hue in turns."""
-    k = (offset + 6 * hue) % 6
-    return value * (1 - saturation * max(0.0, min(1.0, min(k, 4 - k))))
+    return hue, saturation, value
 
 
 @no_type_check

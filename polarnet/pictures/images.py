@@ -74,8 +74,8 @@ def picture_extensions() -> frozenset[str]:
 def read_picture(path: str | os.PathLike[str]) -> Picture:
     """Read the first picture of a file, without alpha and turned upright by its EXIF orientation.
 
-    Raises UnreadablePicture with the reason: no picture, damaged, cut off, camera raw, more than MAX_PIXELS, fewer
-    than three channels, or values that are not finite.
+    UnreadablePicture with the reason: no picture, damaged, cut off, camera raw, more than MAX_PIXELS, fewer than three
+    channels, or values that are not finite.
     """
     pixels, spec, file_format = _read(Path(path))
     profile = spec.get("ICCProfile")
@@ -112,8 +112,8 @@ def upright(pixels: Shaped[np.ndarray, "h w c"], orientation: int) -> Shaped[np.
 def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[np.ndarray, "h w 3"]:
     """Pixels in the colours of `picture` as sRGB code values in [0, 1], out of range clipped.
 
-    The embedded profile decides, in 8 bits; without one, the encoding that the file names (linear light, a gamma,
-    Display P3). Pixels with neither are sRGB already. UnreadablePicture if the profile or encoding cannot be used.
+    The embedded profile decides, in 8 bits; without one, the encoding that the file names. Pixels with neither are sRGB
+    already. UnreadablePicture if the profile or encoding cannot be used.
     """
     pixels = np.clip(pixels, 0, 1)
     if picture.profile is not None:
@@ -127,10 +127,7 @@ def srgb_of(pixels: Float32[np.ndarray, "h w 3"], picture: Picture) -> Float32[n
 
 
 def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[np.ndarray, "h w 3"]:
-    """Code values of a device with this ICC profile as sRGB, in 8 bits; unchanged if the profile is sRGB's own.
-
-    Eight bits are what Pillow's Little CMS converts. The scenes' polarization is random colour anyway.
-    """
+    """Code values of a device with this ICC profile as sRGB, in 8 bits; unchanged if the profile is sRGB's own."""
     try:
         device = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         transform = ImageCms.buildTransform(device, ImageCms.createProfile("sRGB"), "RGB", "RGB")
@@ -171,8 +168,7 @@ def fit(
             f"more than ingest.max_upscale={max_upscale:g}"
         )
     top, left = (rows - part_height) // 2, (columns - part_width) // 2
-    part = pixels[top : top + part_height, left : left + part_width]
-    values = code_fractions(part)
+    values = code_fractions(pixels[top : top + part_height, left : left + part_width])
     if (part_height, part_width) == (height, width):
         return values
     method = cv2.INTER_CUBIC if enlargement > 1 else cv2.INTER_AREA
@@ -205,7 +201,11 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
 
 def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
-    _refuse_by_extension(path)
+    kind = extension(path)
+    if kind in CAMERA_RAW:
+        raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
+    if kind in NOT_IN_THE_WHEEL:
+        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{kind}; convert it to PNG or TIFF first")
     try:
         str(path).encode("utf-8")
     except UnicodeEncodeError:
@@ -218,9 +218,7 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     try:
         spec = file.spec()
         if spec.width * spec.height > MAX_PIXELS:
-            raise UnreadablePicture(
-                f"expected at most {MAX_PIXELS:,} pixels, got {spec.width}x{spec.height}; shrink it"
-            )
+            raise UnreadablePicture(f"expected at most {MAX_PIXELS:,} pixels, got {spec.width}x{spec.height}")
         pixels = file.read_image(0, 0, 0, spec.nchannels, "unknown")
         problem = file.geterror()
     finally:
@@ -234,14 +232,6 @@ def _names_profile(png: Path) -> bool:
     """Whether a PNG has a colour profile before its pixels; OpenImageIO ignores a damaged one."""
     with png.open("rb") as file:
         return b"iCCP" in file.read(2**20).partition(b"IDAT")[0]
-
-
-def _refuse_by_extension(path: Path) -> None:
-    kind = extension(path)
-    if kind in CAMERA_RAW:
-        raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
-    if kind in NOT_IN_THE_WHEEL:
-        raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{kind}; convert it to PNG or TIFF first")
 
 
 def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:

@@ -1,5 +1,6 @@
 """From source pictures to data/images: RGB pictures of one size, each with a split, and a manifest."""
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -16,32 +17,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
 
+from polarnet.pictures import images, polarimetry
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.pictures.images import (
-    UnreadablePicture,
-    extension,
-    fit,
-    picture_extensions,
-    read_picture,
-    srgb_of,
-    write_png,
-)
-from polarnet.pictures.manifest import (
-    Manifest,
-    ManifestEntry,
-    Skipped,
-    listed,
-    split_by_content,
-    write_manifest,
-)
-from polarnet.pictures.polarimetry import (
-    group_by_measurement,
-    parse_raw_mosaic,
-    read_measurement,
-    shrink,
-    write_intensities,
-)
+from polarnet.pictures.images import UnreadablePicture, extension, picture_extensions, write_png
+from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, split_by_content, write_manifest
+from polarnet.pictures.polarimetry import group_by_measurement, parse_raw_mosaic
 from polarnet.runtime.files import claimed, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
@@ -81,9 +62,8 @@ class IngestConfig:
     def __post_init__(self):
         parse_raw_mosaic(self.mosaic)
         if self.val_fraction + self.test_fraction > 1:
-            raise ValueError(
-                f"val_fraction: expected <= 1 - test_fraction = {1 - self.test_fraction:g}, got {self.val_fraction}"
-            )
+            largest = 1 - self.test_fraction
+            raise ValueError(f"val_fraction: expected <= 1 - test_fraction = {largest:g}, got {self.val_fraction}")
 
 
 @dataclass(frozen=True)
@@ -102,18 +82,15 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
     """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing its content.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Neither the mapper nor
-    the order of the files changes the result. The pictures are written beside `folder` first, so that it is never half
-    full. Logs a warning for every file skipped; raises ValueError if no picture is left, or while another process fills
-    `folder`.
+    the order of the files changes the result, and `folder` is never half full. Logs a warning for every file skipped;
+    ValueError if no picture is left, or while another process fills `folder`.
     """
     temporary = folder.with_name(folder.name + ".tmp")
     with claimed(folder):
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        if config.source == "builtin":
-            manifest = _ingest_builtin(config, seed, temporary, mapper)
-        else:
-            manifest = _ingest_folder(config, temporary, mapper)
+        builtin = config.source == "builtin"
+        manifest = (_ingest_builtin if builtin else _ingest_folder)(config, seed, temporary, mapper)
         for skipped in manifest.skipped:
             logger.warning("skipped %s: %s", skipped.file, skipped.reason)
         _check_not_empty(config, manifest)
@@ -136,18 +113,18 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
     return _manifest([entry for group in groups for entry in _split(config, group)], skipped, folder)
 
 
-def _ingest_folder(config: IngestConfig, folder: Path, mapper: Mapper) -> Manifest:
+def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mapper) -> Manifest:
     """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
     sources, ignored, dead = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
+    limit = config.limit or len(sources)
     convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
     entries: list[ManifestEntry] = []
     skipped: list[Skipped] = []
     outcomes: list[ManifestEntry | Skipped] = []
-    while len(outcomes) < len(sources) and (config.limit is None or len(entries) < config.limit):
-        wanted = len(sources) if config.limit is None else config.limit - len(entries)
-        batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + wanted]
+    while len(outcomes) < len(sources) and len(entries) < limit:
+        batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + limit - len(entries)]
         outcomes.extend(mapper(convert, batch))
         entries, skipped = _without_duplicates(outcomes)
     if not entries:
@@ -173,24 +150,15 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipp
     ]
     pictures = [path for path in files if extension(path) in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
-    sources = [
-        Source(
-            files=group,
-            kind=kind,
-            stem=group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0],
-            origin=", ".join(_relative(path, root) for path in group),
-        )
-        for group in groups
-    ]
+    sources = []
+    for group in groups:
+        stem = group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0]
+        sources.append(Source(group, kind, stem, ", ".join(_relative(path, root) for path in group)))
     return sources, len(files) - len(pictures), dead
 
 
 def files_under(root: Path) -> list[Path]:
-    """Files and dead links in a folder and all its subfolders, sorted.
-
-    Links to folders are followed once the folders themselves are read; no folder is read twice, so links may form
-    cycles.
-    """
+    """Files and dead links in a folder, its subfolders and then its linked folders, sorted; no folder is read twice."""
     files: list[Path] = []
     read: set[str] = set()
     folders = [root]
@@ -220,14 +188,11 @@ def _extensions(kind: str) -> frozenset[str]:
 def _edge_hash(files: Sequence[Path]) -> str:
     digest = hashlib.sha256()
     for path in files:
-        try:
-            with path.open("rb") as file:
-                digest.update(file.read(EDGE_BYTES))
-                size = file.seek(0, os.SEEK_END)
-                file.seek(max(0, size - EDGE_BYTES))
-                digest.update(file.read() + str(size).encode())
-        except OSError:  # reported once the file is read
-            continue
+        with contextlib.suppress(OSError), path.open("rb") as file:  # an error is reported once the file is read
+            digest.update(file.read(EDGE_BYTES))
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - EDGE_BYTES))
+            digest.update(file.read() + str(size).encode())
     return digest.hexdigest()
 
 
@@ -235,62 +200,44 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     """Read, cut, scale and convert one file to `folder`/source-<number>.png, or return the reason why not."""
     number, source = item
     try:
-        picture = read_picture(source.files[0])
-        fitted = fit(picture.pixels, config.height, config.width, config.max_upscale)
-        rgb = srgb_of(fitted, picture)
+        picture = images.read_picture(source.files[0])
+        fitted = images.fit(picture.pixels, config.height, config.width, config.max_upscale)
+        rgb = images.srgb_of(fitted, picture)
     except UnreadablePicture as error:
         return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
     file = f"source-{number:08d}.png"
     write_png(folder / file, rgb, picture.bits)
     return ManifestEntry(
-        name=f"{_slug(source.stem)}-{picture.sha256[:8]}",
-        file=file,
-        source=source.kind,
-        origin=source.origin,
-        licence=source.licence or picture.licence,
-        author=source.author or picture.author,
-        sha256=picture.sha256,
-        bits=picture.bits,
-        height=config.height,
-        width=config.width,
-        source_height=picture.pixels.shape[0],
-        source_width=picture.pixels.shape[1],
-        colour_profile=picture.profile_name,
-    )
+        name=f"{_slug(source.stem)}-{picture.sha256[:8]}", file=file, source=source.kind, origin=source.origin,
+        licence=source.licence or picture.licence, author=source.author or picture.author, sha256=picture.sha256,
+        bits=picture.bits, height=config.height, width=config.width, source_height=picture.pixels.shape[0],
+        source_width=picture.pixels.shape[1], colour_profile=picture.profile_name,
+    )  # fmt: skip
 
 
 def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
     """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
     number, source = item
     try:
-        measured = read_measurement(source.files, *parse_raw_mosaic(config.mosaic))
+        measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic))
         if measured.residual > config.residual_max:
             raise UnreadablePicture(
-                f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, more "
-                f"than ingest.residual_max={config.residual_max:g}; is an angle mislabelled, the light not stored "
-                f"linearly, or ingest.mosaic={config.mosaic} wrong?"
+                f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, above "
+                f"ingest.residual_max={config.residual_max:g}; is an angle, linearity or ingest.mosaic wrong?"
             )
     except UnreadablePicture as error:
         return Skipped(source.origin, str(error))
-    shrunk = shrink(measured, config.height, config.width)
+    shrunk = polarimetry.shrink(measured, config.height, config.width)
     file = f"source-{number:08d}.npz"
-    write_intensities(folder / file, shrunk)
+    polarimetry.write_intensities(folder / file, shrunk)
     digest = sha256(measured.intensities.tobytes(), measured.valid.tobytes())
+    (height, width), (source_height, source_width) = shrunk.valid.shape, measured.valid.shape
     return ManifestEntry(
-        name=f"{_slug(source.stem)}-{digest[:8]}",
-        file=file,
-        source=source.kind,
-        origin=source.origin,
-        sha256=digest,
-        bits=16,
-        height=shrunk.valid.shape[0],
-        width=shrunk.valid.shape[1],
-        source_height=measured.valid.shape[0],
-        source_width=measured.valid.shape[1],
-        residual=round(measured.residual, 6),
-        saturated_fraction=round(measured.saturated, 6),
+        name=f"{_slug(source.stem)}-{digest[:8]}", file=file, source=source.kind, origin=source.origin, sha256=digest,
+        bits=16, height=height, width=width, source_height=source_height, source_width=source_width,
+        residual=round(measured.residual, 6), saturated_fraction=round(measured.saturated, 6),
         masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
-    )
+    )  # fmt: skip
 
 
 _CONVERTERS = {"folder": _convert, "polarization": _convert_polarization}
@@ -302,24 +249,13 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     write_png(folder / f"{stem}.png", rgb, bits=8)
     digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
     return ManifestEntry(
-        name=f"{stem}-{digest[:8]}",
-        file=f"{stem}.png",
-        source="dead_leaves",
-        origin=f"generated from seed {seed}",
-        licence="CC0-1.0",
-        author="polarnet",
-        sha256=digest,
-        bits=8,
-        height=config.height,
-        width=config.width,
-        source_height=config.height,
-        source_width=config.width,
-    )
+        name=f"{stem}-{digest[:8]}", file=f"{stem}.png", source="dead_leaves", origin=f"generated from seed {seed}",
+        licence="CC0-1.0", author="polarnet", sha256=digest, bits=8, height=config.height, width=config.width,
+        source_height=config.height, source_width=config.width,
+    )  # fmt: skip
 
 
-def _without_duplicates(
-    outcomes: Iterable[ManifestEntry | Skipped],
-) -> tuple[list[ManifestEntry], list[Skipped]]:
+def _without_duplicates(outcomes: list[ManifestEntry | Skipped]) -> tuple[list[ManifestEntry], list[Skipped]]:
     """The first entry of each content, and everything skipped, duplicates included."""
     first: dict[str, ManifestEntry] = {}
     skipped = []
@@ -348,12 +284,8 @@ def _manifest(entries: Sequence[ManifestEntry], skipped: Sequence[Skipped], fold
     for path in folder.iterdir():
         if path.name not in {entry.file for entry in named}:
             path.unlink()
-    return Manifest(
-        pictures=tuple(sorted(named, key=lambda entry: entry.name)),
-        skipped=tuple(sorted(skipped, key=lambda skip: skip.file)),
-        ignored_files=0,
-        unread_files=0,
-    )
+    pictures = tuple(sorted(named, key=lambda entry: entry.name))
+    return Manifest(pictures, tuple(sorted(skipped, key=lambda skip: skip.file)), ignored_files=0, unread_files=0)
 
 
 def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:

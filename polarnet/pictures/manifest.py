@@ -75,10 +75,9 @@ def listed(skipped: Sequence[Skipped]) -> str:
 
 
 def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: float) -> list[str]:
-    """The split of each picture of one group, by the rank of its content hash.
+    """The split of each picture of one group, by the rank of its content hash, so that names and order do not matter.
 
-    The first ceil(test_fraction n) are test, the next ceil(val_fraction n) val, the rest train. Names and order do not
-    matter, and adding a picture moves only a few others to another split.
+    The first ceil(test_fraction n) are test, the next ceil(val_fraction n) val, the rest train.
     """
     n = len(hashes)
     # the tolerance: 0.1 * 30 is 3.0000000000000004, and nobody who writes 0.1 means 4 of 30

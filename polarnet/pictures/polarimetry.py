@@ -1,13 +1,10 @@
-"""Measured polarization: pictures taken behind polarizers at 0, 45, 90 and 135 degrees, or through a mosaic of them.
-
-Code values are assumed proportional to light, as measurement cameras write them.
-"""
+"""Measured polarization: linear pictures behind polarizers at 0, 45, 90 and 135 degrees, or a mosaic of them."""
 
 import os
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -37,40 +34,37 @@ class Measurement:
     saturated: float  # share of pixels with at least one saturated angle
 
 
-def group_by_measurement(files: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
+def group_by_measurement(files: Sequence[Path]) -> list[tuple[Path, ...]]:
     """Group the files NAME_0, NAME_45, NAME_90, NAME_135 of a folder; every other file is a group of its own."""
     groups: dict[Path, list[Path]] = {}
-    for file in map(Path, files):
+    for file in files:
         match = ANGLE_SUFFIX.fullmatch(file.stem) if file.suffix.lower() != ".npz" else None
         groups.setdefault(file.with_name(match["name"]) if match else file, []).append(file)
     return [tuple(sorted(group)) for group in groups.values()]
 
 
 def parse_raw_mosaic(order: str) -> tuple[Mosaic, str | None]:
-    """Angles of a raw mosaic, and its colours if any: "90 45 / 135 0", or "RGGB 90 45 / 135 0" of a colour sensor.
-
-    The colours are those of the four blocks of 2x2 pixels in each 4x4. ValueError for other text.
-    """
+    """Angles of a raw mosaic, and a colour sensor's colours of the 2x2 blocks in each 4x4: "RGGB 90 45 / 135 0"."""
     colours, _, angles = order.strip().partition(" ")
     return (parse_mosaic(angles), colours) if colours in COLOURS else (parse_mosaic(order), None)
 
 
-def read_measurement(
-    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], mosaic: Mosaic, colours: str | None = None
-) -> Measurement:
-    """Read a measurement from four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic.
-
-    `mosaic` and `colours` are those of `parse_raw_mosaic`.
+def read_measurement(files: Sequence[Path], mosaic: Mosaic, colours: str | None = None) -> Measurement:
+    """Read a measurement from four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic (`parse_raw_mosaic`).
 
     One saturated angle of a pixel is computed from the others, I0 + I90 = I45 + I135; pixels with more are not valid.
-    Raises UnreadablePicture if files are missing, damaged, or do not belong together.
+    UnreadablePicture if files are missing, damaged, or do not belong together.
     """
-    paths = [Path(files)] if isinstance(files, (str, os.PathLike)) else [Path(file) for file in files]
-    if not paths:
-        raise UnreadablePicture("expected the files of a measurement, got none")
-    levels = read_levels(paths)
-    white = white_level(levels)
-    return _measurement(*levels_at_angles(levels, white, mosaic, colours))
+    levels = read_levels(files)
+    values, saturated = levels_at_angles(levels, white_level(levels), mosaic, colours)
+    i0, i45, i90, i135 = values
+    total, count = values.sum(axis=0) / 2, saturated.sum(axis=0)
+    trusted = (count == 0) & (total > 0)
+    if not trusted.any():
+        raise UnreadablePicture("no pixel is lit and unsaturated at all four angles")
+    residual = float(np.median(np.abs(i0 + i90 - i45 - i135)[trusted] / total[trusted]))
+    intensities = without_saturation(values, saturated).astype(np.float32)
+    return Measurement(intensities, count <= 1, residual, saturated=float((count > 0).mean()))
 
 
 def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
@@ -110,11 +104,8 @@ def demosaic(
     """Each angle at the centre of every 2x2 cell but those on the rim: shape (h // 2 - 2, w // 2 - 2).
 
     The four pixels of a cell look at four places, and an edge between them would look polarized. So each angle is
-    interpolated bilinearly, with weights 9, 3, 3, 1 of 16, where all four then agree: half a pixel right of and below
-    the cell's first pixel.
-
-    A sensor with `colours` has cells of 4x4 pixels, of which the mean of the two green blocks counts: polarization
-    differs between colours. The mean of an angle's two pixels lies half a pixel from the cell's centre.
+    interpolated bilinearly, with weights 9, 3, 3, 1 of 16. A sensor with `colours` has cells of 4x4 pixels, of which
+    the mean of the two green blocks counts; it lies half a pixel from the cell's centre.
     """
     cell, near = (2, 3) if colours is None else (4, 7)
     height, width = raw.shape[0] // cell, raw.shape[1] // cell
@@ -122,10 +113,8 @@ def demosaic(
     at_angle = {}
     for row in (0, 1):
         for column in (0, 1):
-            blocks = [
-                raw[2 * down + row : cell * height : cell, 2 * right + column : cell * width : cell]
-                for down, right in greens
-            ]
+            whole = raw[row : cell * height, column : cell * width]
+            blocks = [whole[2 * down :: cell, 2 * right :: cell] for down, right in greens]
             samples = blocks[0] if colours is None else (blocks[0] + blocks[1]) / 2
             # the centre of a cell lies below its upper samples and above its lower ones
             vertical = samples[2:] if row == 0 else samples[:-2]
@@ -150,12 +139,8 @@ def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
     def scaled(plane: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
         return cv2.resize(plane[part].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
-    return Measurement(
-        intensities=np.stack([scaled(plane) for plane in measurement.intensities]),
-        valid=scaled(~measurement.valid) == 0,
-        residual=measurement.residual,
-        saturated=measurement.saturated,
-    )
+    intensities = np.stack([scaled(plane) for plane in measurement.intensities])
+    return replace(measurement, intensities=intensities, valid=scaled(~measurement.valid) == 0)
 
 
 def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
@@ -171,33 +156,15 @@ def read_intensities(path: str | os.PathLike[str]) -> tuple[Float32[Tensor, "4 h
         return torch.from_numpy(steps.astype(np.float32) / STEPS), torch.from_numpy(file["valid"])
 
 
-def _measurement(values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarray, "4 h w"]) -> Measurement:
-    i0, i45, i90, i135 = values
-    total = values.sum(axis=0) / 2
-    trusted = ~saturated.any(axis=0) & (total > 0)
-    if not trusted.any():
-        raise UnreadablePicture("no pixel is lit and unsaturated at all four angles")
-    residual = np.abs(i0 + i90 - i45 - i135)[trusted] / total[trusted]
-    count = saturated.sum(axis=0)
-    return Measurement(
-        intensities=without_saturation(values, saturated).astype(np.float32),
-        valid=count <= 1,
-        residual=float(np.median(residual)),
-        saturated=float((count > 0).mean()),
-    )
-
-
 def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
     """Level at which values saturate; UnreadablePicture unless they have 8 or 16 bits or are floats in [0, 1].
 
-    16-bit values are assumed to saturate at the lowest of 10, 12, 14 and 16 bits that holds them all, because cameras
-    often leave the upper bits empty.
+    In 16-bit files, it is that of the lowest of 10, 12, 14 and 16 bits that hold all values.
     """
     if values.dtype == np.uint8:
         return 255.0
     if values.dtype == np.uint16:
-        highest = int(values.max())
-        return float(min(white for white in WHITE_LEVELS if white >= highest))
+        return float(min(white for white in WHITE_LEVELS if white >= values.max()))
     if np.issubdtype(values.dtype, np.floating):
         if not (values.min() >= 0 and values.max() <= 1):  # false for NaN too
             raise UnreadablePicture(f"expected floats in [0, 1], got {values.min():g} to {values.max():g}")

@@ -9,8 +9,7 @@ from jaxtyping import Int64
 from torch import Tensor
 
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow
-from polarnet.events.windows import windows_of
+from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow, windows_of
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.methods.method import State, each_map
 from polarnet.networks.registry import load_network

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from polarnet.events.stream import Events
-from polarnet.events.windows import BIN_EDGES, events_per_pixel
+from polarnet.events.streaming import BIN_EDGES, events_per_pixel
 from polarnet.pictures.manifest import Manifest, read_manifest
 from polarnet.reports.legend import legend_of
 from polarnet.reports.maps import polarization_hsv

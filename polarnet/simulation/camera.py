@@ -1,13 +1,96 @@
-"""The simulated camera: its sensors, the polarizers before their pixels, and their readout."""
+"""The simulated camera: its sensors, the polarizers before their pixels, and their readout.
 
+Polarizers weight the Stokes parameters: films before whole sensors, or a mosaic. In the readout, all events of a row at
+one time leave together, one row after another, and get their time when they leave. The bus carries a limited number of
+events a second; rows that wait for too long are lost.
+"""
+
+import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any, NamedTuple, TypeVar
 
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from polarnet.events.mosaic import places_of
+from polarnet.events.stream import Events, select
 from polarnet.runtime.machine import seed_for
+from polarnet.runtime.sections import one_of, section
+from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.emulator import EmulatorConfig
-from polarnet.simulation.polarizers import IDEAL, PolarizersConfig
+from polarnet.simulation.pixels import randomness
 from polarnet.simulation.ranges import RandomisedConfig, draws
-from polarnet.simulation.readout import PERFECT, ReadoutConfig
+from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
+
+Value = TypeVar("Value")
+FourValues = Annotated[list[Value], Field(min_length=NUM_CHANNELS, max_length=NUM_CHANNELS)]
+MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8 all five count alike
+
+
+@section
+class PolarizersConfig(RandomisedConfig):
+    """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
+
+    layout: Annotated[str, one_of(("four_sensors", "dofp"))]
+    """four_sensors: each polarizer covers a sensor of its own; dofp: one sensor, one polarizer a pixel."""
+    mosaic: str
+    """Angles over 2x2 pixels of a DoFP sensor, even row / odd row."""
+    extinction_ratio: FourValues[Annotated[float, Field(ge=1)] | None]
+    """Transmission along the axis over that across it; null: infinite."""
+    angle_error_deg: FourValues[Annotated[float, Field(ge=-90, le=90)]]
+    transmission: FourValues[Annotated[float, Field(gt=0, le=1)]]
+    """Transmission of light polarized along the axis."""
+    extinction_spread: NonNegativeFloat
+    """Standard deviation between pixels of the natural logarithm of the extinction ratio."""
+    angle_spread_deg: NonNegativeFloat
+    """Standard deviation of the angle between pixels."""
+    transmission_spread: NonNegativeFloat
+    """Relative standard deviation of the transmission between pixels."""
+    crosstalk: Annotated[float, Field(ge=0, le=MAX_CROSSTALK)]
+    """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        parse_mosaic(self.mosaic)
+        if self.crosstalk and self.layout != "dofp":
+            raise ValueError(f"crosstalk: expected 0 with layout {self.layout}, got {self.crosstalk}")
+
+    @property
+    def uniform(self) -> bool:
+        """Whether each channel has a sensor of its own, all of whose pixels see through the same polarizer."""
+        spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
+        return self.layout == "four_sensors" and not spread
+
+
+IDEAL = PolarizersConfig(
+    layout="four_sensors", mosaic="90 45 / 135 0", extinction_ratio=[None] * NUM_CHANNELS,
+    angle_error_deg=[0.0] * NUM_CHANNELS, transmission=[1.0] * NUM_CHANNELS, extinction_spread=0.0,
+    angle_spread_deg=0.0, transmission_spread=0.0, crosstalk=0.0, randomise=None,
+)  # fmt: skip
+
+
+@section
+class ReadoutConfig(RandomisedConfig):
+    """Section `readout` of params.yaml: how events leave the sensor."""
+
+    row_latency_us: NonNegativeFloat
+    """Delay of each row behind the row above it."""
+    jitter_us: NonNegativeFloat
+    """Standard deviation of an event's time."""
+    max_events_per_s: PositiveFloat | None
+    """Events that the bus of a sensor carries per second; null: no limit."""
+    max_wait_us: NonNegativeFloat
+    """Longest time that a row waits for the bus; a row that would wait longer is lost."""
+
+    @property
+    def perfect(self) -> bool:
+        """Whether every event leaves at once, with its own time."""
+        return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
+
+
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
 
 
 @dataclass(frozen=True)
@@ -36,14 +119,120 @@ class Camera:
 
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""
-        values = self.draws(seed, sequence)
-        return Camera(
-            replace(self.sensor, **values.get("emulate", {}), randomise=None),
-            replace(self.polarizers, **values.get("polarizers", {}), randomise=None),
-            replace(self.readout, **values.get("readout", {}), randomise=None),
-            seed_for(seed, sequence, purpose),
+        sensor, polarizers, readout = (
+            replace(section, **draws(section, seed, sequence), randomise=None) for section in self._sections.values()
         )
+        return Camera(sensor, polarizers, readout, seed_for(seed, sequence, purpose))
 
     @property
-    def _sections(self) -> dict[str, RandomisedConfig]:
+    def _sections(self) -> dict[str, Any]:
         return {"emulate": self.sensor, "polarizers": self.polarizers, "readout": self.readout}
+
+
+class Grid(NamedTuple):
+    """Pixels of a channel; they see points of the scene that lie `pitch` pixels apart: 1, or 2 for a DoFP sensor."""
+
+    height: int
+    width: int
+    pitch: int = 1
+
+
+def grid(layout: str, height: int, width: int) -> Grid:
+    """The pixels of each channel of a sensor; ValueError for a DoFP sensor with an odd side."""
+    if layout == "four_sensors":
+        return Grid(height, width)
+    if height % 2 or width % 2:
+        raise ValueError(f"layout dofp: expected a sensor with even sides, for whole 2x2 cells, got {height}x{width}")
+    return Grid(height // 2, width // 2, 2)
+
+
+def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of a channel of a sensor; ValueError as `grid`."""
+    return grid(layout, height, width)[:2]
+
+
+def weights_of(
+    polarizers: PolarizersConfig, height: int, width: int, key: int
+) -> Float32[np.ndarray, "sensors 3 *pixels"]:
+    """Weights of S0, S1 and S2 at each sensor, for each pixel if pixels differ, as `key` (64 bits) seeds."""
+    channels = np.arange(NUM_CHANNELS)
+    if polarizers.layout == "dofp":
+        grid(polarizers.layout, height, width)
+        cell = np.searchsorted(POLARIZER_ANGLES_DEG, parse_mosaic(polarizers.mosaic))
+        channels = np.tile(cell, (1, height // 2, width // 2))
+    elif not polarizers.uniform:
+        channels = np.broadcast_to(channels[:, None, None], (NUM_CHANNELS, height, width))
+
+    def spread(purpose: int, deviation: float) -> Float64[np.ndarray, "*pixels"]:
+        if deviation == 0:
+            return np.zeros(channels.shape)
+        maps = [randomness.normal_map(np.uint64(key), purpose, i, channels[i].size) for i in range(len(channels))]
+        return deviation * np.stack(maps).reshape(channels.shape).astype(np.float64)
+
+    angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))[channels]
+    angles = angles + spread(randomness.POLARIZER_ANGLE, math.radians(polarizers.angle_spread_deg))
+    along = np.array(polarizers.transmission)[channels]
+    along = (along * (1 + spread(randomness.TRANSMISSION, polarizers.transmission_spread))).clip(0, 1)
+    ratios = np.array([math.inf if ratio is None else ratio for ratio in polarizers.extinction_ratio])[channels]
+    ratios = np.maximum(ratios * np.exp(spread(randomness.EXTINCTION, polarizers.extinction_spread)), 1)
+    return analyzer(angles, ratios, along).swapaxes(0, 1).astype(np.float32)
+
+
+def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float) -> Float32[np.ndarray, "n h w"]:
+    """Light on a DoFP sensor with a share `crosstalk` from each pixel's four neighbours; edge pixels are repeated."""
+    if crosstalk == 0:
+        return frames
+    padded = np.pad(frames, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    neighbours = padded[:, :-2, 1:-1] + padded[:, 2:, 1:-1] + padded[:, 1:-1, :-2] + padded[:, 1:-1, 2:]
+    return np.float32(1 - crosstalk) * frames + np.float32(crosstalk / 4) * neighbours
+
+
+def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np.ndarray, "4 n h2 w2"]:
+    """Channels at 0, 45, 90 and 135 degrees of a DoFP sensor's frames: each one pixel of every 2x2 cell."""
+    return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])
+
+
+def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
+    """The events of one sensor as they leave it, in time order, and the number of events lost on the bus.
+
+    `key` (64 bits) seeds the jitter. Events that would leave after `duration_us` are missing.
+    """
+    if config.perfect or len(events) == 0:
+        return events, 0
+    forget_stale_code()
+    t, y = events.t.numpy(), events.y.numpy()
+    times_us = t + config.row_latency_us * y
+    if config.jitter_us:
+        jitter = randomness.normal_map(np.uint64(key), randomness.TIMESTAMP, 0, len(t))
+        times_us = times_us + config.jitter_us * jitter.astype(np.float64)
+    order = np.lexsort((y, t, np.rint(times_us))) if config.jitter_us or config.row_latency_us else np.arange(len(t))
+    times_us, rows = np.maximum(times_us[order], 0), y[order].astype(np.int64)
+    carried = np.ones(len(order), bool)
+    if config.max_events_per_s:
+        times_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
+    stamps = np.rint(times_us).astype(np.int64)
+    left = carried & (stamps <= duration_us)
+    leaving = replace(select(events, torch.from_numpy(order[left])), t=torch.from_numpy(stamps[left]))
+    return leaving, int((~carried).sum())
+
+
+@compiled
+def _bus(
+    times_us: Float64[np.ndarray, " n"], rows: Int64[np.ndarray, " n"], event_us: float, max_wait_us: float
+) -> tuple[Float64[np.ndarray, " n"], np.ndarray]:
+    """Time at which each event leaves the bus, which takes `event_us` per event, and whether the bus carries it."""
+    leaves_us, carried = np.empty(times_us.size), np.zeros(times_us.size, np.bool_)
+    free_us, first = -np.inf, 0
+    while first < times_us.size:
+        stop = first + 1
+        while stop < times_us.size and rows[stop] == rows[first] and times_us[stop] - times_us[first] < 1:
+            stop += 1
+        start_us = max(free_us, times_us[first])
+        row_carried = start_us - times_us[first] <= max_wait_us
+        if row_carried:
+            free_us = start_us + event_us * (stop - first)
+        for i in range(first, stop):
+            carried[i] = row_carried
+            leaves_us[i] = free_us if row_carried else times_us[i]
+        first = stop
+    return leaves_us, carried

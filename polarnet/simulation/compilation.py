@@ -14,9 +14,10 @@ ZERO, ONE = np.int64(0), np.int64(1)
 """0 and 1 as int64 arguments of kernels: numba would compile a kernel once for a literal and once more for int64."""
 
 
-def compiled(kernel: Callable) -> Any:
+def compiled(kernel: Callable, **options: Any) -> Any:
     """Compile a kernel on its first call."""
-    return numba.njit(nogil=True, cache=True, error_model="numpy")(_bare(kernel))
+    bare = inspect.unwrap(kernel)  # tests wrap a type checker around every function
+    return numba.njit(nogil=True, cache=True, error_model="numpy", **options)(bare)
 
 
 def borrowing(kernel: Callable) -> Any:
@@ -24,17 +25,12 @@ def borrowing(kernel: Callable) -> Any:
 
     The counts of array slices are atomic, and cost up to 9 % of an emulation.
     """
-    without_counts: Any = {"_nrt": False}  # numba's name, absent from its type stubs
-    return numba.njit(nogil=True, cache=True, error_model="numpy", **without_counts)(_bare(kernel))
+    return compiled(kernel, _nrt=False)
 
 
 def inlined(kernel: Callable) -> Any:
     """Compile a small kernel into each kernel that calls it."""
-    return numba.njit(nogil=True, cache=True, error_model="numpy", inline="always")(_bare(kernel))
-
-
-def _bare(kernel: Callable) -> Callable:
-    return inspect.unwrap(kernel)  # tests wrap a type checker around every function
+    return compiled(kernel, inline="always")
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Emulation of a scene store into an event store, part by part, so that a run can stop and resume."""
+"""Emulation of a scene store: into an event store, part by part so that a run can resume, or in memory on the fly."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -6,23 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from polarnet import __version__
-from polarnet.events.stream import Events
-from polarnet.simulation.camera import Camera
+from polarnet.events.stream import Events, slice_time
+from polarnet.simulation.camera import Camera, channel_size
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.polarizers import channel_size
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
+Mapper = Callable[..., Iterable[Any]]
+CAPACITY = 8  # sequences in memory, about 25 MB each at 120x180 px and 2 million events
+
 
 def emulate_scenes(
-    scenes: str | Path,
-    events: str | Path,
-    camera: Camera,
-    seed: int,
-    mapper: Callable[..., Iterable[Any]],
-    threads: int,
+    scenes: str | Path, events: str | Path, camera: Camera, seed: int, mapper: Mapper, threads: int
 ) -> int:
     """Emulate all sequences of a scene store into an event store, and return their number; both may be at a URL.
 
@@ -31,9 +28,9 @@ def emulate_scenes(
     run of the same scenes, camera and seed makes the missing parts.
     """
     source = SceneStore.open(scenes)
-    attributes = origin_of(source, camera, seed)
     size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
-    store = EventStore.create(events, source.sequences, *size, attributes, source.sequences_per_part)
+    origin = origin_of(source, camera, seed)
+    store = EventStore.create(events, source.sequences, *size, origin, source.sequences_per_part)
     task = functools.partial(_emulate_part, scenes=source, events=store, camera=camera, seed=seed, threads=threads)
     for _ in mapper(task, store.missing_parts()):
         pass
@@ -43,12 +40,8 @@ def emulate_scenes(
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     """All settings and data that determine the events of a scene store."""
-    return {
-        **camera.sections,
-        "seed": seed,
-        "scenes": scenes.attributes,
-        "polarnet": __version__,  # an unfinished store of another version is not resumed
-    }
+    origin = {"seed": seed, "scenes": scenes.attributes, "polarnet": __version__}  # other versions are not resumed
+    return {**camera.sections, **origin}
 
 
 def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
@@ -66,3 +59,32 @@ def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Cam
     for sequence in events.parts[part]:
         channels = emulate_sequence(scenes, sequence, camera, seed, threads)
         events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence))
+
+
+class EmulatedEvents:
+    """An `EventSource` that emulates in memory the same events that `emulate_scenes` would store.
+
+    Sequences are emulated as a whole, because the pixels have memory. The last `capacity` sequences stay in memory for
+    further reads. A copy in another process starts with none.
+    """
+
+    def __init__(self, scenes: SceneStore, camera: Camera, seed: int, threads: int = 1, capacity: int = CAPACITY):
+        self.path, self.sequences = scenes.path, scenes.sequences
+        self.height, self.width = channel_size(camera.polarizers.layout, scenes.sensor_height, scenes.sensor_width)
+        self.attributes = origin_of(scenes, camera, seed)
+        self._settings = scenes, camera, seed, threads, capacity
+        self._emulated = functools.lru_cache(capacity)(
+            lambda sequence: emulate_sequence(scenes, sequence, camera, seed, threads)
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._settings
+
+    def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
+        """Events of the four channels with start_us <= t < stop_us (default: all), in microseconds of the sequence.
+
+        Raises ValueError for a sequence that the scene store does not have.
+        """
+        channels, start_us = self._emulated(sequence), start_us or 0
+        stop_us = self._settings[0].duration_us(sequence) + 1 if stop_us is None else max(start_us, stop_us)
+        return [slice_time(events, start_us, stop_us) for events in channels]

@@ -12,15 +12,13 @@ from pydantic import PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate
-from polarnet.runtime.arrays import Array, as_tensor, check_range, check_shape
+from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range, check_shape
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
 from polarnet.simulation.pixels.defects import DefectsConfig, defects_of, with_defects
-from polarnet.simulation.pixels.esim import EsimConfig
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.pixels.voltmeter import VoltmeterConfig
 from polarnet.simulation.ranges import RandomisedConfig
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
@@ -43,8 +41,7 @@ class Steps(NamedTuple):
 class PixelModel(Protocol):
     """A pixel model: a module of `polarnet.simulation.pixels`. `start` and `advance` are compiled kernels."""
 
-    EIGHT_BIT_VIDEO: bool
-    """Whether the model sees an 8-bit video: whole digital numbers at regular times."""
+    EIGHT_BIT_VIDEO: bool  # whether the model sees whole digital numbers at regular times
 
     def physics_of(self, config: "EmulatorConfig") -> Any:
         """The model's parameters as a NamedTuple."""
@@ -63,11 +60,10 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(EsimConfig, VoltmeterConfig, DefectsConfig, RandomisedConfig):
+class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A model ignores the parameters that it does not have. `emulate` takes the values as they are: ranges in `randomise`
-    are drawn before (`Camera.drawn`).
+    A model ignores the parameters that it does not have. Ranges in `randomise` are drawn before (`Camera.drawn`).
 
     >>> from dataclasses import replace
     >>> from polarnet.simulation import SENSORS
@@ -86,7 +82,7 @@ class SensorState:
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
-    >>> events, state = emulate(torch.zeros(2, 4, 8, 8), torch.tensor([0, 1000]), SENSORS["clean"], key=1)
+    >>> _, state = emulate(torch.zeros(2, 4, 8, 8), torch.tensor([0, 1000]), SENSORS["clean"], key=1)
     >>> state.t_us
     1000.0
     """
@@ -121,13 +117,12 @@ def emulate(
 ) -> tuple[list[Events], SensorState]:
     """Events of each channel of a sensor that sees `frames` at times `t_us`, and the sensor's state after them.
 
-    Frames are uint8, or float in digital numbers 0..255; frames and times may be numpy or torch.
-    Without a state, the pixels are adapted to the first frame, which fires no event. A clip cut into pieces, each
-    given the state that the previous piece returned, gives the events of the whole clip. `key` (64 bits) seeds all
-    noise. Each channel draws its mismatch and noise by its number in `channels` (default: 0, 1, ...). Events are in
-    the order (t, y, x, p), and identical for any number of threads and any order of channels.
-    TypeError for anything but an array; ValueError for times that do not increase, values that are not finite or
-    outside 0..255, and sizes that do not fit.
+    Frames are uint8, or float in digital numbers 0..255. Without a state, the pixels adapt to the first frame, which
+    fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
+    clip. `key` (64 bits) seeds all noise, which each channel draws by its number in `channels` (default: 0, 1, ...).
+    Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels. TypeError
+    for anything but an array; ValueError for times that do not increase, values that are not finite or outside
+    0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -213,27 +208,19 @@ def _check_frames(
             f"emulate: expected frames (n, channels, h, w) with one time each and at least one frame, "
             f"got frames {tuple(frames.shape)} and {len(times)} times"
         )
-    if frames.dtype != torch.uint8 and not frames.is_floating_point():
-        raise ValueError(f"emulate: expected frames as uint8 or float digital numbers (0..255), got {frames.dtype}")
-    if frames.dtype != torch.uint8 and not (torch.isfinite(frames).all() and (frames >= 0).all()):
-        raise ValueError("emulate: expected finite frames >= 0, got NaN, infinite or negative values")
     if frames.dtype != torch.uint8:
+        if not frames.is_floating_point():
+            raise ValueError(f"emulate: expected frames as uint8 or float digital numbers (0..255), got {frames.dtype}")
+        check_finite("frames", frames)
         check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
     if len(set(channels)) != frames.shape[1]:
-        raise ValueError(
-            f"emulate: expected {frames.shape[1]} different channel numbers, one per channel, got {channels}"
-        )
+        raise ValueError(f"emulate: expected {frames.shape[1]} different channel numbers, got {channels}")
     before = times if state is None else np.concatenate([[state.t_us], times])
     if not (np.isfinite(before).all() and (np.diff(before) > 0).all()):
-        raise ValueError(
-            "emulate: expected strictly increasing times in microseconds"
-            + ("" if state is None else f", the first after the state's {state.t_us}")
-            + f", got {times[:5].tolist()}..."
-        )
-    if state is not None and state.model != model:
-        raise ValueError(f"emulate: the state is of model {state.model}, the configuration of {model}")
-    if state is not None and (*state.channels, state.height, state.width) != (*channels, *frames.shape[2:]):
-        raise ValueError(
-            f"emulate: the state is of channels {state.channels} of {state.height}x{state.width} pixels, "
-            f"the frames are of channels {channels} of {frames.shape[2]}x{frames.shape[3]}"
-        )
+        after = "" if state is None else f", the first after the state's {state.t_us}"
+        raise ValueError(f"emulate: expected strictly increasing times in us{after}, got {times[:5].tolist()}...")
+    if state is not None:
+        theirs = f"model {state.model}, channels {state.channels} of {state.height}x{state.width} pixels"
+        ours = f"model {model}, channels {channels} of {frames.shape[2]}x{frames.shape[3]} pixels"
+        if theirs != ours:
+            raise ValueError(f"emulate: expected a state of {ours}, got one of {theirs}")

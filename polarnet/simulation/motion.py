@@ -123,9 +123,9 @@ class Trajectory:
     @classmethod
     def from_vector(cls, vector: Float64[np.ndarray, " n"]) -> "Trajectory":
         """The trajectory with the coefficients of `to_vector`, exactly; ValueError for another number of them."""
-        names = cls.vector_names()
-        if vector.shape != (len(names),):
-            raise ValueError(f"a trajectory has {len(names)} coefficients, got an array of shape {vector.shape}")
+        length = len(cls.vector_names())
+        if vector.shape != (length,):
+            raise ValueError(f"a trajectory has {length} coefficients, got an array of shape {vector.shape}")
         x, y, *coefficients, speed_px_s = vector.tolist()
         sines = [Sine(*coefficients[i : i + 3]) for i in range(0, len(coefficients), 3)]
         x_sines, y_sines = tuple(sines[:HARMONICS]), tuple(sines[HARMONICS : 2 * HARMONICS])
@@ -144,9 +144,9 @@ def random_trajectory(
 ) -> Trajectory:
     """A smooth motion of a sensor inside a scene.
 
-    The velocity along each axis is a sum of harmonics. The slowest harmonic lets the sensor swing over the scene and
-    turn back before the border. The peak speed is drawn between the configured bounds and reached at a random time.
-    Raises ValueError if the scene is too small for the sensor or for its slowest motion.
+    The velocity along each axis is a sum of harmonics, the slowest of which turns the sensor back before the border.
+    The peak speed is drawn between the configured bounds and reached at a random time. ValueError if the scene is too
+    small for the sensor or for its slowest motion.
 
     >>> import numpy as np
     >>> from polarnet.simulation import MOTIONS, random_trajectory
@@ -207,15 +207,10 @@ def _random_shape(generator: np.random.Generator) -> _Shape:
     speed = np.hypot(*velocity)
     peak = speed.max() * (1 + GRID_SLACK)
     position = (speeds[:, :, None] / order[:, None] * np.sin(angles)).sum(axis=1) / peak
+    lowest, extent = position.min(axis=1), position.max(axis=1) - position.min(axis=1)
     acceleration = np.hypot(*(speeds[:, :, None] * order[:, None] * np.sin(angles)).sum(axis=1)) / peak
-    return _Shape(
-        speeds=speeds / peak,
-        phases=phases,
-        lowest=position.min(axis=1),
-        extent=position.max(axis=1) - position.min(axis=1),
-        acceleration=acceleration.max() * (1 + GRID_SLACK),
-        peak_phase=float(PHASES[speed.argmax()]),
-    )
+    peak_phase = float(PHASES[speed.argmax()])
+    return _Shape(speeds / peak, phases, lowest, extent, acceleration.max() * (1 + GRID_SLACK), peak_phase)
 
 
 def _placed(
@@ -238,15 +233,8 @@ def _placed(
     x_sines, y_sines = (tuple(Sine(*sine) for sine in axis) for axis in sines)
     roll = generator.uniform(0, math.radians(config.rotation_max_deg))
     zoom = generator.uniform(0, (config.zoom_max - 1) / 2)
-    return Trajectory(
-        float(x),
-        float(y),
-        x_sines,
-        y_sines,
-        roll=_turn(roll, 2.0, config, speed, generator),
-        zoom=_turn(zoom, 3.0, config, speed, generator),
-        speed_px_s=speed,
-    )
+    rolls, zooms = _turn(roll, 2.0, config, speed, generator), _turn(zoom, 3.0, config, speed, generator)
+    return Trajectory(float(x), float(y), x_sines, y_sines, rolls, zooms, speed)
 
 
 def _drift_share(config: SynthesizeConfig) -> float:
@@ -300,9 +288,8 @@ def render(
 ) -> Float32[Tensor, "n 3 h w"]:
     """(S0, S1, S2) on the moving sensor at times `t_s` in seconds, interpolated bilinearly from those of the scene.
 
-    `sensor_to_scene` maps sensor pixel (row, column) to a point of the scene; pixel centres are at integers in both.
-    The camera measures angles from its own axes: rolled by an angle a, it sees the scene's AoLP minus a. Its pixels are
-    `pitch` scene pixels apart: 2 for the cells of a DoFP sensor.
+    Pixel centres are at integers in sensor and scene. The camera measures angles from its own axes: rolled by an angle
+    a, it sees the scene's AoLP minus a. Its pixels are `pitch` scene pixels apart: 2 for the cells of a DoFP sensor.
     """
     pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
     return torch.from_numpy(render_poses(scene, pose._replace(zoom=pose.zoom / pitch), height, width))
@@ -320,11 +307,9 @@ def render_poses(scene: PolarizationScene, pose: Pose, height: int, width: int) 
 def sensor_to_scene(
     x: float, y: float, angle: float, zoom: float, height: int, width: int
 ) -> tuple[float, float, float, float]:
-    """(left, top, along, across): sensor pixel (row, column) looks at this point of the scene.
+    """(left, top, along, across) of a sensor whose centre, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
 
-    x = left + column * along - row * across
-    y = top + column * across + row * along
-    The centre of the sensor, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
+    Pixel (row, column) looks at (left + column along - row across, top + column across + row along) of the scene.
     """
     along, across = math.cos(angle) / zoom, math.sin(angle) / zoom
     middle_row, middle_column = (height - 1) / 2, (width - 1) / 2

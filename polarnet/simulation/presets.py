@@ -1,16 +1,13 @@
-"""Ready-made sensors and motions for callers from Python, from the settings beside the code.
-
-A program installed from a wheel has the settings of the wheel, a clone those of its params.yaml.
-"""
+"""Ready-made sensors and motions for callers from Python: the settings of the wheel, or of a clone's params.yaml."""
 
 from dataclasses import replace
 from typing import Any
 
 from ruamel.yaml import YAML
 
+from polarnet.simulation.camera import IDEAL
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
-from polarnet.simulation.polarizers import IDEAL
 from polarnet.terminal.installation import shipped_settings
 
 

@@ -31,9 +31,11 @@ class RandomisedConfig:
                 raise ValueError(f"randomise.{name}: expected at least one name, got {values}")
             if name not in NAMES:
                 _check_bounds(name, values)
+            present = getattr(self, name)
             for value in values:
+                whole = [value] * len(present) if isinstance(present, list) else value
                 try:
-                    dataclasses.replace(self, randomise=None, **{name: _repeated(getattr(self, name), value)})
+                    dataclasses.replace(self, randomise=None, **{name: whole})
                 except ValueError as error:
                     first_line, _, _ = str(error).partition("\n")  # the others say the same of further list values
                     raise ValueError(f"randomise.{first_line}") from None
@@ -41,11 +43,8 @@ class RandomisedConfig:
 
 def _drawable(config: RandomisedConfig) -> list[str]:
     """Names of the parameters that are numbers, or lists of numbers, or in NAMES."""
-    return [
-        name
-        for name, value in vars(config).items()
-        if (name in NAMES or not isinstance(value, (str, bool, dict))) and name != "randomise"
-    ]
+    numbers = {name for name, value in vars(config).items() if not isinstance(value, (str, bool, dict))}
+    return [name for name in vars(config) if name in numbers.union(NAMES) - {"randomise"}]
 
 
 def _check_bounds(name: str, values: list[float | str]) -> None:
@@ -53,14 +52,7 @@ def _check_bounds(name: str, values: list[float | str]) -> None:
     if len(values) != 2 or numbers != values or numbers[0] > numbers[1]:
         raise ValueError(f"randomise.{name}: expected [lowest, highest], got {values}")
     if name.endswith(LOGARITHMIC) and numbers[0] <= 0:
-        raise ValueError(
-            f"randomise.{name}: expected a lowest value > 0, got {values}; its logarithm is drawn uniformly"
-        )
-
-
-def _repeated(value: Any, number: float | str) -> Any:
-    """`number`, or as many of them as `value` has if that is a list."""
-    return [number] * len(value) if isinstance(value, list) else number
+        raise ValueError(f"randomise.{name}: expected a lowest value > 0, got {values}; the logarithm is drawn")
 
 
 def draws(config: RandomisedConfig, seed: int, sequence: str) -> dict[str, Any]:

@@ -16,14 +16,11 @@ from pydantic import Field
 from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid, grid, read_out
 from polarnet.simulation.dataset import origin_of
 from polarnet.simulation.emulator import Channels, emulate_frames
 from polarnet.simulation.motion import Trajectory
-from polarnet.simulation.moving_sensor import checked_pose, rendered_chunks
-from polarnet.simulation.polarizers import Grid, grid
-from polarnet.simulation.readout import read_out
-from polarnet.simulation.rendering import behind_polarizers, render_times_us
+from polarnet.simulation.moving_sensor import behind_polarizers, checked_pose, render_times_us, rendered_chunks
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import NUM_CHANNELS, analyzer
 from polarnet.storage.events import EventStore
@@ -64,18 +61,17 @@ def emulate_rotating(
     trajectory: Trajectory,
     duration_us: int,
     pixels: Grid,
-    threads: int = 1,
 ) -> Events:
-    """Events of one sensor of a camera, behind the rotating polarizer, that moves over a scene for `duration_us`.
+    """Events of one sensor, behind the rotating polarizer alone, that moves over a scene for `duration_us`.
 
-    The camera's own polarizers count for nothing. ValueError if the sensor leaves the scene.
+    ValueError if the sensor leaves the scene.
     """
     size, sensor = (pixels.height, pixels.width), camera.sensor
     t_us = render_times_us(trajectory, duration_us, *size, sensor, abs(rotating.rate_hz) * rotating.frames_per_turn)
     pose = checked_pose(scene, trajectory, t_us, size, pixels.pitch)
     rendered = rendered_chunks(scene, pose, t_us, size)
     frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
-    (events,), _ = emulate_frames(Channels((0,), *size, sensor, camera.key), frames, threads=threads)
+    (events,), _ = emulate_frames(Channels((0,), *size, sensor, camera.key), frames)
     return read_out(events, camera.readout, camera.key, duration_us)[0]
 
 
@@ -89,9 +85,8 @@ def emulate_rotating_scenes(
 ) -> int:
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
-    Sensor, readout and motion are those of the four channels, but the noise differs. Events are in the store's first
-    channel; the other three are empty. A store of the same scenes and settings is kept, any other is replaced.
-    `mapper` is as in `dataset.emulate_scenes`.
+    Events are in the store's first channel; the other three are empty. A store of the same scenes and settings is kept,
+    any other is replaced. `mapper` is as in `dataset.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}

@@ -8,17 +8,8 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from polarnet.runtime.arrays import (
-    TOLERANCE,
-    Array,
-    as_tensor,
-    check_finite,
-    check_range,
-    check_same_shape,
-    check_shape,
-    floats,
-    fractions,
-)
+from polarnet.runtime import arrays
+from polarnet.runtime.arrays import Array, check_range, check_shape, floats, fractions
 from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
 
 EPSILON = np.finfo(np.float32).eps  # keeps grey and black from dividing by 0
@@ -39,7 +30,7 @@ class PolarizationScene:
     stokes: Float32[Tensor, "3 h w"]
 
     def __post_init__(self):
-        check_shape("stokes", as_tensor("stokes", self.stokes), "3 height width")
+        check_shape("stokes", arrays.as_tensor("stokes", self.stokes), "3 height width")
         if not isinstance(self.stokes, Tensor) or self.stokes.dtype != torch.float32:
             raise TypeError(f"stokes: expected a torch tensor of float32, got {self.stokes.dtype}")
 
@@ -56,11 +47,11 @@ class PolarizationScene:
 
 def check_scene(scene: PolarizationScene) -> None:
     """Raise ValueError for an unphysical scene: NaN, S0 outside [0, 1], or hypot(S1, S2) above S0."""
-    check_finite("scene", scene.stokes)
+    arrays.check_finite("scene", scene.stokes)
     s0, s1, s2 = scene.stokes
     check_range("scene", s0, 0, 1, "S0")
     excess = float((torch.hypot(s1, s2) - s0).max())
-    if excess > TOLERANCE:
+    if excess > arrays.TOLERANCE:
         raise ValueError(
             f"scene: expected hypot(S1, S2) <= S0, got an excess of {excess:g}; "
             f"scene_from_intensities scales noisy measurements down"
@@ -70,10 +61,9 @@ def check_scene(scene: PolarizationScene) -> None:
 def polarization_from_rgb(rgb: Float[Array, "3 h w"]) -> Float32[Tensor, "3 h w"]:
     """(S0, DoLP, AoLP) of a picture: its value, saturation and hue (paper, section 3.1).
 
-    The picture is RGB in [0, 1] as floating-point numbers of any precision; hue and saturation are computed in float32.
     The full circle of hue maps to AoLP in [0, pi): red 0, green pi/3, blue 2 pi/3. Grey has DoLP 0 and AoLP 0.
-    Raises TypeError if `rgb` is not an array, and ValueError, with the remedy, for integers, values outside [0, 1],
-    another order of axes, NaN and infinity.
+    TypeError if `rgb` is not an array; ValueError for integers, values outside [0, 1], another order of axes, NaN and
+    infinity.
     """
     hue, saturation, value = _hsv(fractions("picture", rgb, "3 height width", "RGB"))
     aolp = hue * (math.pi / 360)
@@ -85,8 +75,8 @@ def scene_from_polarization(
 ) -> PolarizationScene:
     """The scene with given intensity and DoLP, both in [0, 1], and AoLP in radians.
 
-    Raises TypeError for arguments that are not arrays. Raises ValueError for different shapes, integers, NaN,
-    intensities and DoLP outside [0, 1], and angles outside [-pi, pi], which are probably in degrees.
+    TypeError for arguments that are not arrays; ValueError for different shapes, integers, NaN, intensities and DoLP
+    outside [0, 1], and angles outside [-pi, pi], which are probably in degrees.
 
     >>> import torch
     >>> from polarnet.simulation import scene_from_polarization
@@ -95,15 +85,13 @@ def scene_from_polarization(
     """
     s0, dolp = (fractions(name, image, "height width").float() for name, image in (("s0", s0), ("dolp", dolp)))
     aolp = floats("aolp", aolp, "height width").float()
-    check_same_shape({"s0": s0, "dolp": dolp, "aolp": aolp})
+    arrays.check_same_shape({"s0": s0, "dolp": dolp, "aolp": aolp})
     check_range("aolp", aolp, -math.pi, math.pi, "radians", "convert degrees with torch.deg2rad")
     return PolarizationScene(stokes_from_polarization(s0, dolp, aolp))
 
 
 def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
-    """The scene whose (S0, DoLP, AoLP) are the value, saturation and hue of a picture in [0, 1].
-
-    Raises TypeError and ValueError as `polarization_from_rgb`.
+    """The scene whose (S0, DoLP, AoLP) are those of `polarization_from_rgb`, which says what is raised.
 
     >>> import torch
     >>> from polarnet.simulation import scene_from_rgb
@@ -117,8 +105,8 @@ def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationSc
     """The scene measured behind polarizers at 0, 45, 90 and 135 degrees, in linear light, I0 + I90 at most 1.
 
     Noise makes some measurements unphysical: S1 and S2 are scaled down where hypot(S1, S2) exceeds S0.
-    Raises TypeError if `intensities` is not an array, and ValueError for integers, NaN, another order of axes, negative
-    values, and S0 above 1.
+    TypeError as for `scene_from_polarization`; ValueError for integers, NaN, another order of axes, negative values and
+    S0 above 1.
 
     >>> import torch
     >>> from polarnet.simulation import scene_from_intensities

@@ -9,11 +9,10 @@ from torch import Tensor, tensor
 from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, grid
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.polarizers import grid
 from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
 from polarnet.simulation.truth import frames_of
 
@@ -55,9 +54,8 @@ def simulate(
     Hue becomes AoLP, saturation DoLP and value S0, as in the pipeline. The same arguments give the same numbers.
     A sensor alone is behind ideal polarizers; a `Camera` has its own polarizers and readout.
 
-    Raises TypeError for arguments of another kind. Raises ValueError for integers (divide 8 bits by 255, 16 bits by
-    65535), values outside [0, 1], another order of axes, NaN and infinity, unphysical scenes, and pictures
-    too small for the sensor and its motion. The message gives the remedy.
+    TypeError for arguments of another kind; ValueError for integers, values outside [0, 1], another order of axes, NaN
+    and infinity, unphysical scenes, and pictures too small for the sensor and its motion. The message gives the remedy.
 
     >>> from dataclasses import replace
     >>> import torch
@@ -75,11 +73,8 @@ def simulate(
             raise TypeError(f"{name}: expected {expected} such as {example}, got {value!r}")
     if not isinstance(seed, (int, np.integer)):
         raise TypeError(f"seed: expected a whole number, got {seed!r}")
-    if isinstance(picture, PolarizationScene):
-        scene = picture
-        check_scene(scene)
-    else:
-        scene = scene_from_rgb(picture)
+    scene = picture if isinstance(picture, PolarizationScene) else scene_from_rgb(picture)
+    check_scene(scene)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     camera = (sensor if isinstance(sensor, Camera) else Camera(sensor)).drawn(seed, "picture")
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)

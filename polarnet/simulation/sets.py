@@ -3,19 +3,18 @@
 A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by the same code as the pipeline's own.
 """
 
-import dataclasses
 import functools
 import json
 import logging
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, PositiveFloat
 
-from polarnet.pictures.images import picture_extensions
+from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
@@ -67,7 +66,7 @@ class Recipe:
 def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
     """Make a test set of the test pictures of `images` under the motion of `sets`; False if it is complete already."""
     harder = {name: value for name, value in asdict(sets).items() if name != "measured_root"}
-    recipe = dataclasses.replace(recipe, motion=dataclasses.replace(recipe.motion, **harder))
+    recipe = replace(recipe, motion=replace(recipe.motion, **harder))
     return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
 
 
@@ -76,17 +75,15 @@ def make_folder_set(
 ) -> bool:
     """Make a test set of all photographs or measured scenes under `root`; False if it is complete already.
 
-    A `limit` takes that many pictures at most, chosen by content hash. `kind` is photographs, polarization, or auto,
-    which looks at the files. Raises ValueError if no picture can be used.
+    At most `limit` pictures are chosen by content hash. `kind` is photographs, polarization, or auto, which looks at
+    the files. ValueError if no picture can be used.
     """
     if not root.is_dir():
         actual = "a file" if root.exists() else "no such folder"
         raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
-    chosen = dataclasses.replace(
-        recipe.ingest, source=source, root=str(root), limit=limit, val_fraction=0.0, test_fraction=1.0
-    )
-    recipe = dataclasses.replace(recipe, ingest=chosen)
+    chosen = replace(recipe.ingest, source=source, root=str(root), limit=limit, val_fraction=0.0, test_fraction=1.0)
+    recipe = replace(recipe, ingest=chosen)
     return _make(folder, recipe, mapper, lambda to: ingest(chosen, recipe.seed, to, mapper("ingest")), _content(root))
 
 
@@ -95,26 +92,27 @@ def kind_of(root: Path) -> str:
 
     Raw mosaics look like photographs: name their kind.
     """
-    files = [path for path in files_under(root) if path.is_file()]
-    if any(path.suffix.lower() == ".npz" for path in files):
-        return "polarization"
-    pictures = [path for path in files if path.suffix.lower().lstrip(".") in picture_extensions()]
-    return "polarization" if any(len(group) == 4 for group in group_by_measurement(pictures)) else "photographs"
+    kinds = picture_extensions() | {"npz"}
+    files = [path for path in files_under(root) if path.is_file() and extension(path) in kinds]
+    measured = any(len(group) == 4 or extension(group[0]) == "npz" for group in group_by_measurement(files))
+    return "polarization" if measured else "photographs"
 
 
 def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path], Any], source: str) -> bool:
-    """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures.
+    """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures; False if it is complete.
 
     `fill` writes the pictures into a folder, and `source` is the hash of its input. A folder made with other settings
-    or input is emptied first, as is one whose files have changed since, with a warning. Returns False if the folder is
-    complete already. Changes of the code are not noticed: DVC checks them for the pipeline's sets.
+    or input is emptied first, as is one whose files have changed since, with a warning. DVC notices changes of code.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
     settings = sections | {"seed": recipe.seed, "source": source}
     key = sha256(json.dumps(settings, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():
-        progress = _progress(note)
+        try:
+            progress = dict(json.loads(note.read_bytes()))
+        except (TypeError, ValueError):  # damaged
+            progress = {}
         changed = changed_files(folder) if progress.get("complete") else []
         for problem in changed:
             logger.warning("%s; making the set again", problem.partition(";")[0])
@@ -138,14 +136,6 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     return True
 
 
-def _progress(note: Path) -> dict[str, Any]:
-    """Settings' hash and completeness of a folder; empty for a damaged note."""
-    try:
-        return dict(json.loads(note.read_bytes()))
-    except (TypeError, ValueError):
-        return {}
-
-
 def _content(folder: Path) -> str:
     """Hash of the names and bytes of all files in a folder."""
     files = [path for path in files_under(folder) if path.is_file()]
@@ -163,5 +153,5 @@ def _hold_out(source: Path, images: Path) -> None:
     temporary.mkdir()
     for entry in held_out:
         shutil.copy(source / entry.file, temporary / entry.file)
-    write_manifest(dataclasses.replace(manifest, pictures=held_out), temporary)
+    write_manifest(replace(manifest, pictures=held_out), temporary)
     temporary.rename(images)

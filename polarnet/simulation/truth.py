@@ -19,14 +19,10 @@ from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed,
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
+from polarnet.simulation import scene as scene_module
+from polarnet.simulation.camera import IDEAL, channel_size, grid
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
-from polarnet.simulation.polarizers import IDEAL, channel_size, grid
-from polarnet.simulation.scene import (
-    PolarizationScene,
-    polarization_from_rgb,
-    scene_from_intensities,
-    scene_from_polarization,
-)
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import Contents, FrameStore
 from polarnet.storage.scenes import Scene, SceneStore, as_stored
@@ -50,15 +46,11 @@ def frames_of(
 ) -> tuple[Float[Tensor, "n 4 h w"], Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
     """(intensity behind the four polarizers, DoLP, AoLP) on a sensor that moves over a scene, at times in microseconds.
 
-    Interpolation applies to Stokes parameters, because angles cannot be averaged; all three results follow from them.
-    Pixels lie `pitch` pixels of the scene apart (`polarizers.grid`).
+    Interpolation applies to Stokes parameters, because angles cannot be averaged. Pixels lie `pitch` pixels of the
+    scene apart (`polarizers.grid`).
     """
-    stokes_frames = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width, pitch)
-    return (
-        stokes.intensities_from_stokes(stokes_frames).clamp(0, 1),
-        stokes.dolp(stokes_frames).clamp(0, 1),
-        stokes.aolp(stokes_frames),
-    )
+    s = render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width, pitch)
+    return stokes.intensities_from_stokes(s).clamp(0, 1), stokes.dolp(s).clamp(0, 1), stokes.aolp(s)
 
 
 def valid_frames(
@@ -68,10 +60,8 @@ def valid_frames(
 
     Interpolation weights are not negative, so the rendered mask of invalid pixels is 0 exactly there.
     """
-    masked = (~valid).float()
-    scene, t_s = PolarizationScene(masked.expand(3, -1, -1)), np.asarray(t_us) * 1e-6
-    rendered = render(scene, trajectory, t_s, height, width, pitch)
-    return rendered[:, 0] == 0
+    scene = PolarizationScene((~valid).float().expand(3, -1, -1))
+    return render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width, pitch)[:, 0] == 0
 
 
 @dataclass(frozen=True)
@@ -93,10 +83,8 @@ def synthesize(
 
     A scene is a picture of `synthesis.images`, or a variant of a training picture. `mapper` is
     `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks makes one part of
-    the stores. Every trajectory depends only on the seed and the sequence's name. A run after an interruption makes the
-    missing parts.
-
-    Skips every picture too small for the sensor and its motion, with a warning. Raises ValueError if none is left.
+    the stores, and a run after an interruption the missing parts. Pictures too small for the sensor and its motion are
+    skipped with a warning; ValueError if none is left.
     """
     manifest = read_manifest(synthesis.images)
     motions, skipped = motions_of(manifest, synthesis.motion, synthesis.seed, synthesis.variation)
@@ -123,42 +111,31 @@ def motions_of(
     """Motions over all scenes, and the pictures that are too small for the sensor and its motion."""
     motions, skipped = [], []
     for entry in manifest.pictures:
+        variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
+        scenes = [entry.name, *(f"{entry.name}-variant{k:02d}" for k in range(1, variants + 1))]
+        names = [(f"{scene}-{number:02d}", scene) for scene in scenes for number in range(config.sequences_per_picture)]
+        size = entry.height, entry.width
         try:
-            motions.extend(_motions(entry, config, seed, variation))
+            paths = [random_trajectory(config, *size, generator_for(seed, name, "motion")) for name, _ in names]
         except ValueError as error:
             skipped.append(Skipped(entry.origin, str(error)))
+            continue
+        motions += [Motion(*name, entry.name, entry.split, path) for name, path in zip(names, paths, strict=True)]
     return motions, skipped
 
 
-def _motions(
-    entry: ManifestEntry, config: SynthesizeConfig, seed: int, variation: VariationConfig | None
-) -> list[Motion]:
-    variants = variation.scenes_per_picture if variation and entry.split == "train" else 0
-    scenes = [entry.name, *(f"{entry.name}-variant{k:02d}" for k in range(1, variants + 1))]
-    names = [(f"{scene}-{number:02d}", scene) for scene in scenes for number in range(config.sequences_per_picture)]
-    motions = []
-    for sequence, scene in names:
-        generator = generator_for(seed, sequence, "motion")
-        trajectory = random_trajectory(config, entry.height, entry.width, generator)
-        motions.append(Motion(sequence, scene, entry.name, entry.split, trajectory))
-    return motions
-
-
 def _create(
-    scenes: str | Path,
-    frames: str | Path,
-    entries: Sequence[ManifestEntry],
-    motions: Sequence[Motion],
-    synthesis: Synthesis,
+    scenes: str | Path, frames: str | Path, entries: list[ManifestEntry], motions: list[Motion], synthesis: Synthesis
 ) -> tuple[SceneStore, FrameStore]:
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
     config, variation, per_part = synthesis.motion, synthesis.variation, synthesis.sequences_per_part
+    files = [(entry.file.encode(), b"\0", bytes.fromhex(sha256(synthesis.images / entry.file))) for entry in entries]
     attributes = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
         "layout": synthesis.layout,
         "seed": synthesis.seed,
-        "images_sha256": _digest(entries, synthesis.images),
+        "images_sha256": sha256(*itertools.chain.from_iterable(files)),
     }
     scene_of = {motion.sequence: motion.scene for motion in motions}
     splits = {motion.sequence: motion.split for motion in motions}
@@ -166,13 +143,10 @@ def _create(
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
+    largest = max(entry.height for entry in entries), max(entry.width for entry in entries)
+    names = Trajectory.vector_names()
     scene_store = SceneStore.create(
-        scenes,
-        contents,
-        scene_of,
-        largest_picture=(max(entry.height for entry in entries), max(entry.width for entry in entries)),
-        sensor=sensor,
-        trajectory_names=Trajectory.vector_names(),
+        scenes, contents, scene_of, largest_picture=largest, sensor=sensor, trajectory_names=names
     )
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
     size = channel_size(synthesis.layout, *sensor)
@@ -199,11 +173,8 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
 def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Scene:
     """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
     polarization, valid = _read_polarization(synthesis.images, picture)
-    variation = synthesis.variation
-    if variation and scene != picture:
-        if valid is not None:  # unknown polarization must not move to known pixels
-            variation = replace(variation, mirrored_share=0.0)
-        polarization = varied(polarization, variation, generator_for(synthesis.seed, scene, "variation"))
+    if synthesis.variation and scene != picture:
+        polarization = varied(polarization, synthesis.variation, generator_for(synthesis.seed, scene, "variation"))
     s0, dolp, aolp = polarization
     return as_stored(Scene(s0, dolp, aolp, valid))
 
@@ -212,13 +183,7 @@ def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w
     """(S0, DoLP, AoLP) of a photograph or measurement, and the mask of known pixels (None: all are known)."""
     measured = images / f"{picture}.npz"
     if not measured.exists():
-        return polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
+        return scene_module.polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
     intensities, valid = read_intensities(measured)
-    s = scene_from_intensities(intensities).stokes
+    s = scene_module.scene_from_intensities(intensities).stokes
     return torch.stack([s[0].clamp(max=1), stokes.dolp(s).clamp(max=1), stokes.aolp(s)]), valid
-
-
-def _digest(entries: Sequence[ManifestEntry], images: Path) -> str:
-    """Hash of all picture files."""
-    files = [entry.file for entry in entries]
-    return sha256(*(part for name in files for part in (name.encode(), b"\0", bytes.fromhex(sha256(images / name)))))

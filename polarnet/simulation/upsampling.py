@@ -1,7 +1,7 @@
-"""Interpolated frames between those of a clip, so that nothing moves by more than about one pixel a step.
+"""Interpolated frames between those of a clip, so that nothing moves by more than about one pixel a step, as in v2e.
 
-The rule is v2e's automatic upsampling. v2e interpolates with a network (SuperSloMo); here the frames before and after
-are warped along the optical flow (DIS, Kroeger et al. 2016) and blended. Both are wrong where one thing hides another.
+v2e interpolates with a network (SuperSloMo); here the frames before and after are warped along the optical flow (DIS,
+Kroeger et al. 2016) and blended. Both are wrong where one thing hides another.
 """
 
 import math
@@ -62,10 +62,5 @@ def _grey(before: Float32[Tensor, "h w"], after: Float32[Tensor, "h w"]) -> list
 def _warped(frame: Float32[np.ndarray, "h w 3"], flow: Float32[np.ndarray, "h w 2"]) -> Float32[np.ndarray, "h w 3"]:
     """The frame at the places that `flow` points to; weighted means of Stokes parameters stay physical."""
     rows, columns = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
-    return cv2.remap(
-        frame,
-        columns + flow[..., 0].astype(np.float32),
-        rows + flow[..., 1].astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    x, y = columns + flow[..., 0].astype(np.float32), rows + flow[..., 1].astype(np.float32)
+    return cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,12 +1,9 @@
 """Variants of training scenes: AoLP rotated, DoLP rescaled or drawn towards one value, intensity regraded.
 
 Photographs are highly polarized, because saturation becomes DoLP; measured scenes are hardly polarized. Variants lie in
-between and have any angle, so that a network cannot learn the averages of one kind of scene. A scene of about one hue
-has nearly uniform polarization. The logarithms of the four channels then change alike for any DoLP, and the only cue
-left is the pixel's response to dim and bright light. `uniform_share` makes more such scenes.
-
-Polarization follows colour in photographs, and shape and material in measured scenes. `mirrored_share` makes scenes
-whose light says less about their polarization.
+between and have any angle, so that a network cannot learn the averages of one kind of scene. In uniform polarization
+the four channels change alike for any DoLP, and the only cue left is the pixel's response to dim and bright light:
+`uniform_share` makes more such scenes.
 """
 
 import math
@@ -22,8 +19,6 @@ from polarnet import stokes
 from polarnet.runtime.sections import one_of, section
 
 MAX_DOLP = 0.99
-MIRRORED = ((-1,), (-2,), (-1, -2))
-"""Image axes of the mirrorings that `mirrored_share` draws from."""
 SPACINGS = ("linear", "logarithmic")
 
 
@@ -40,16 +35,13 @@ class VariationConfig:
     dolp_exponent_spread: NonNegativeFloat
     """DoLP is first raised to a power whose natural logarithm has mean 0 and this standard deviation."""
     dolp_spacing: Annotated[str, one_of(SPACINGS)]
-    """Distribution of the factor: linear draws it uniformly, logarithmic draws its logarithm uniformly, so that a
-    DoLP of a few percent, as in most measured scenes, is as frequent as a large one."""
+    """Distribution of the factor; logarithmic makes a DoLP of a few percent as frequent as a large one."""
     s0_factor: list[Annotated[float, Field(gt=0, le=1)]]
     s0_exponent_spread: NonNegativeFloat
     uniform_share: Annotated[float, Field(ge=0, le=1)]
     """Share of variants whose polarization is drawn towards a uniform one of random DoLP and AoLP."""
     uniform_weight: list[Annotated[float, Field(ge=0, le=1)]]
     """[smallest, largest] weight of the uniform polarization; 1: DoLP and AoLP are constant."""
-    mirrored_share: Annotated[float, Field(ge=0, le=1)]
-    """Share of variants whose DoLP and AoLP are mirrored against S0, along one image axis or both."""
 
     def __post_init__(self):
         for name in ("dolp_factor", "s0_factor", "uniform_weight"):
@@ -73,25 +65,15 @@ def varied(
         dolp = dolp.clamp(max=MAX_DOLP)
     if generator.random() < config.share:
         s0 = _graded(s0, config.s0_factor, config.s0_exponent_spread, generator)
-    if generator.random() < config.uniform_share:
-        dolp, aolp = _drawn_to_one(dolp, aolp, config.uniform_weight, generator)
-    if generator.random() < config.mirrored_share:
-        axes = MIRRORED[generator.integers(len(MIRRORED))]
-        dolp, aolp = dolp.flip(axes), aolp.flip(axes)
+    if generator.random() < config.uniform_share:  # the weighted mean of the scene's (s1, s2) and a constant
+        lightest, heaviest = config.uniform_weight
+        share = generator.uniform(lightest, heaviest)
+        degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
+        mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
+        mean[1] += share * degree * math.cos(2 * angle)
+        mean[2] += share * degree * math.sin(2 * angle)
+        dolp, aolp = stokes.dolp(mean).clamp(max=MAX_DOLP), stokes.aolp(mean)
     return torch.stack([s0, dolp, aolp])
-
-
-def _drawn_to_one(
-    dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"], weight: list[float], generator: np.random.Generator
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """DoLP and AoLP of the weighted mean of the scene's (s1, s2) and a constant."""
-    lightest, heaviest = weight
-    share = generator.uniform(lightest, heaviest)
-    degree, angle = generator.uniform(0, MAX_DOLP), generator.uniform(0, math.pi)
-    mean = stokes.stokes_from_polarization(torch.ones_like(dolp), (1 - share) * dolp, aolp)
-    mean[1] += share * degree * math.cos(2 * angle)
-    mean[2] += share * degree * math.sin(2 * angle)
-    return stokes.dolp(mean).clamp(max=MAX_DOLP), stokes.aolp(mean)
 
 
 def _graded(

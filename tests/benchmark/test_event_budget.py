@@ -16,7 +16,7 @@ from polarnet.analysis.event_budget import (
 from polarnet.analysis.resimulate import StoredSequences
 from polarnet.benchmark.rows import opened
 from polarnet.config.tree import load
-from polarnet.events.windows import events_per_pixel
+from polarnet.events.streaming import events_per_pixel
 from polarnet.methods import METHODS
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore

@@ -24,7 +24,7 @@ from polarnet.simulation import (
     scene_from_intensities,
     simulate,
 )
-from polarnet.simulation.readout import PERFECT
+from polarnet.simulation.camera import PERFECT
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 from polarnet.storage.events import EventStore

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from event_fixtures import events_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +14,6 @@ from polarnet.events.representations import (
     event_counts,
     event_tensor,
     normalise_nonzero,
-    time_surface,
     voxel_grid,
 )
 from polarnet.events.stream import Events
@@ -23,12 +23,6 @@ def test_event_tensor_weighs_polarity_by_time_since_the_first_event(make_events)
     """Paper Eq. 5 with t0 = 100: pixel (0, 0) 1 * 0 + 1 * 10/50, pixel (1, 0) -1 * 25/50, pixel (2, 1) +1 * 50/50."""
     events = make_events([(100, 0, 0, 1), (110, 0, 0, 1), (125, 1, 0, -1), (150, 2, 1, 1)], 2, 3)
     torch.testing.assert_close(event_tensor(events, 50), torch.tensor([[0.2, -0.5, 0.0], [0.0, 0.0, 1.0]]))
-
-
-def test_event_tensor_does_not_depend_on_when_the_window_opened(make_events):
-    early = make_events([(100, 0, 0, 1), (110, 0, 0, 1)], 1, 1)
-    late = make_events([(1100, 0, 0, 1), (1110, 0, 0, 1)], 1, 1)
-    assert torch.equal(event_tensor(early, 50), event_tensor(late, 50))
 
 
 def test_event_counts_are_the_net_and_the_total_number_of_events(make_events):
@@ -54,15 +48,7 @@ def test_events_of_a_single_instant_fall_into_bin_zero(make_events, count):
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 3), st.sampled_from([-1, 1])), max_size=30))
 def test_the_bins_of_a_voxel_grid_add_up_to_the_polarities_of_each_pixel(rows):
     rows = sorted(rows)
-    t, x, p = ([row[i] for row in rows] for i in range(3))
-    events = Events(
-        torch.tensor(t, dtype=torch.int64),
-        torch.tensor(x, dtype=torch.int16),
-        torch.zeros(len(rows), dtype=torch.int16),
-        torch.tensor(p, dtype=torch.int8),
-        1,
-        4,
-    )
+    events = events_of([(t, x, 0, p) for t, x, p in rows], 1, 4)
     expected = torch.zeros(4).index_add(0, events.x.long(), events.p.float())
     torch.testing.assert_close(voxel_grid(events, 5).sum(0)[0], expected, atol=1e-5, rtol=0)
 
@@ -80,12 +66,6 @@ def test_normalising_survives_equal_entries_and_no_entries():
     assert normalise_nonzero(torch.tensor([[[0.0, 3.0], [0.0, 0.0]]])).abs().max() == 0
 
 
-def test_time_surface_shows_each_pixels_last_polarity_faded_by_its_age(make_events):
-    events = make_events([(0, 0, 0, 1), (10, 1, 0, 1), (60, 0, 0, -1), (110, 2, 0, 1)], 1, 4)
-    expected = torch.tensor([[-math.exp(-0.5), math.exp(-1.0), 1.0, 0.0]])
-    torch.testing.assert_close(time_surface(events, 100), expected)
-
-
 @pytest.mark.parametrize("name", REPRESENTATIONS)
 def test_every_representation_of_no_events_is_zero_and_has_its_number_of_channels(name):
     encode = REPRESENTATIONS[name]
@@ -93,7 +73,7 @@ def test_every_representation_of_no_events_is_zero_and_has_its_number_of_channel
     assert image.dtype == torch.float32
     assert image.abs().max() == 0
     assert image.shape == ((channels_of(encode), 4, 6) if image.ndim == 3 else (4, 6))
-    assert channels_of(encode) == {"event_tensor": 1, "event_counts": 2, "voxel_grid": 5, "time_surface": 1}[name]
+    assert channels_of(encode) == {"event_tensor": 1, "event_counts": 2, "voxel_grid": 5}[name]
 
 
 @pytest.mark.parametrize("name", REPRESENTATIONS)

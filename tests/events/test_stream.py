@@ -27,21 +27,18 @@ def test_a_time_slice_holds_its_start_but_not_its_stop(make_events):
     assert len(slice_time(events, 31, 40)) == 0
 
 
-def test_a_count_slice_shares_the_memory_of_the_stream(make_events):
-    events = make_events([(0, 0, 0, 1), (10, 1, 0, 1), (20, 2, 0, -1)], 1, 3)
-    part = slice_count(events, 1, 3)
-    assert part.t.tolist() == [10, 20]
-    assert part.t.data_ptr() == events.t[1:].data_ptr()
-
-
 def test_a_crop_counts_from_its_own_corner(make_events):
     events = make_events([(0, 4, 3, 1), (1, 5, 3, -1), (2, 7, 5, 1), (3, 8, 3, 1)], 8, 10)
     assert rows(crop(events, top=3, left=5, height=3, width=3)) == [(1, 0, 0, -1), (2, 2, 2, 1)]
 
 
-def test_a_crop_beyond_the_sensor_is_refused(make_events):
+def test_sizes_that_do_not_fit_are_refused(make_events):
     with pytest.raises(ValueError, match="rows 3 to 9"):
         crop(make_events([], 8, 10), top=3, left=0, height=6, width=3)
+    with pytest.raises(ValueError, match="8x10"):
+        downscale(make_events([], 8, 10), 16, 5, keep_rate=False)
+    with pytest.raises(ValueError, match="one sensor"):
+        merge([Events.empty(2, 2), Events.empty(2, 3)])
 
 
 def test_downscaling_by_scaled_coordinates_keeps_every_event(make_events):
@@ -75,11 +72,6 @@ def test_downscaling_works_by_ratios_that_are_no_whole_numbers(make_random_event
     assert int(fewer.p.sum()) <= int(events.p.sum()) / (240 * 400 / (120 * 180)) + 120 * 180
 
 
-def test_a_sensor_cannot_be_downscaled_to_a_larger_one(make_events):
-    with pytest.raises(ValueError, match="8x10"):
-        downscale(make_events([], 8, 10), 16, 5, keep_rate=False)
-
-
 def test_pieces_of_a_stream_join_to_the_stream(make_random_events):
     events = make_random_events(1, 100, 1000, 5, 5)
     parts = [slice_count(events, 0, 30), slice_count(events, 30, 30), slice_count(events, 30, 100)]
@@ -92,11 +84,6 @@ def test_pieces_that_overlap_in_time_are_not_joined_but_merged(make_events):
     with pytest.raises(ValueError, match=r"piece 1 starts at 5 us, before .* 10 us; merge\(\)"):
         concatenate([first, second])
     assert rows(merge([first, second])) == [(0, 0, 0, 1), (5, 1, 0, -1), (10, 0, 0, 1), (10, 1, 0, -1)]
-
-
-def test_streams_of_different_sensors_are_not_joined():
-    with pytest.raises(ValueError, match="one sensor"):
-        merge([Events.empty(2, 2), Events.empty(2, 3)])
 
 
 @pytest.mark.parametrize(

@@ -2,24 +2,15 @@ import itertools
 
 import pytest
 import torch
+from event_fixtures import events_of, random_events
 
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.streaming import WindowCutter, WindowRule, parse_window
-from polarnet.events.windows import cut_windows
+from polarnet.events.streaming import WindowCutter, WindowRule, cut_windows, parse_window
 
 HEIGHT, WIDTH, DURATION_US = 6, 8, 20_000
 
 
-def random_events(seed, count=300):
-    generator = torch.Generator().manual_seed(seed)
-    t = torch.randint(DURATION_US, (count,), generator=generator).sort().values
-    x = torch.randint(WIDTH, (count,), generator=generator).short()
-    y = torch.randint(HEIGHT, (count,), generator=generator).short()
-    p = (2 * torch.randint(2, (count,), generator=generator) - 1).to(torch.int8)
-    return Events(t, x, y, p, HEIGHT, WIDTH)
-
-
-CHANNELS = [random_events(seed) for seed in range(4)]
+CHANNELS = [random_events(seed, 300, DURATION_US - 1, HEIGHT, WIDTH) for seed in range(4)]
 
 
 def windows(rule, pieces=1):
@@ -93,9 +84,7 @@ def test_rules_that_make_no_windows_are_refused(rule, reason):
 
 
 def test_an_event_at_a_windows_end_belongs_to_the_next_window_in_batches_and_streams_alike():
-    t = torch.tensor([0, 400, 999, 1000, 1500, 2000, 3000])
-    zeros, ones = torch.zeros_like(t), torch.ones_like(t)
-    channel = Events.from_columns(t, zeros, zeros, ones, HEIGHT, WIDTH)
+    channel = events_of([(t, 0, 0, 1) for t in (0, 400, 999, 1000, 1500, 2000, 3000)], HEIGHT, WIDTH)
     batch = cut_windows(channel, torch.tensor([0, 1000, 2000, 3000]))
     streamed = list(WindowCutter(WindowRule(1000, None, None), HEIGHT, WIDTH).add([channel] * 4, 3001))
     expected = [[0, 400, 999], [1000, 1500], [2000]]
@@ -105,8 +94,7 @@ def test_an_event_at_a_windows_end_belongs_to_the_next_window_in_batches_and_str
 
 def test_a_time_stamp_far_in_the_future_is_refused_and_a_long_recording_is_not():
     def event(t_us: list[int]) -> Events:
-        ones = torch.ones(len(t_us))
-        return Events(torch.tensor(t_us), ones.short(), ones.short(), ones.to(torch.int8), 4, 4)
+        return events_of([(t, 1, 1, 1) for t in t_us], 4, 4)
 
     hour_us = 3_600_000_000
     cutter = WindowCutter(WindowRule(hour_us // 2, None, None), 4, 4, channels=1)
@@ -117,9 +105,7 @@ def test_a_time_stamp_far_in_the_future_is_refused_and_a_long_recording_is_not()
 
 def test_the_last_two_events_before_each_step_make_a_window():
     """Events at 10, 20, 120, 130 and 250 us, a step of 100 us; the window starts with the first of the two."""
-    t = torch.tensor([10, 20, 120, 130, 250])
-    zeros = torch.zeros_like(t)
-    channel = Events.from_columns(t, zeros, zeros, torch.ones_like(t), 1, 1)
+    channel = events_of([(t, 0, 0, 1) for t in (10, 20, 120, 130, 250)], 1, 1)
     cut = list(WindowCutter(WindowRule(None, 2, 100), 1, 1, channels=1).add([channel], 300))
     assert [(w.start_us, w.stop_us, w.channels[0].t.tolist()) for w in cut] == [
         (10, 100, [10, 20]), (120, 200, [120, 130]), (130, 300, [130, 250]),

@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 
 from polarnet.events.representations import event_tensor, voxel_grid_of_window
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.windows import cut_windows, encode_windows, windows_of
+from polarnet.events.streaming import cut_windows, encode_windows, windows_of
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
 from polarnet.training.engine.sequences import WindowDataset
@@ -29,16 +29,6 @@ def stores(tmp_path_factory, make_random_events):
     events.finish()
     frames.finish()
     return EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr")
-
-
-def test_windows_lie_between_consecutive_frames():
-    assert windows_of(T_US) == [(0, 33_333), (33_333, 66_667), (66_667, 100_000)]
-
-
-def test_an_event_at_a_frame_belongs_to_the_window_that_starts_there_and_at_the_last_frame_to_none(make_events):
-    times = [0, 33_332, 33_333, 66_667, 100_000, 100_001]
-    windows = cut_windows(make_events([(t, 0, 0, 1) for t in times], 1, 1), T_US)
-    assert [window.t.tolist() for window in windows] == [[0, 33_332], [33_333], [66_667]]
 
 
 @settings(max_examples=30, deadline=None)

@@ -10,8 +10,7 @@ import torch
 from polarnet.config.tree import load
 from polarnet.events.representations import event_counts, event_tensor, voxel_grid
 from polarnet.events.stream import Events
-from polarnet.events.streaming import EventWindow
-from polarnet.events.windows import encode_windows
+from polarnet.events.streaming import EventWindow, encode_windows
 from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer, told, weighted_counts
 from polarnet.methods.intensities import from_intensities, with_gain

@@ -17,9 +17,8 @@ from polarnet.methods.rotating_polarizer import (
     local_variance,
     rotating_recoverer,
 )
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import Sine, Trajectory
-from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.rotating import emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.truth import frames_of

@@ -1,7 +1,6 @@
 """Generated pictures: the same from the same seed, and like photographs in what matters."""
 
 import itertools
-import time
 
 import cv2
 import numpy as np
@@ -16,17 +15,11 @@ def pictures() -> list[np.ndarray]:
     return [dead_leaves(generator_for(1, f"picture {i}", "test"), 200, 300) for i in range(8)]
 
 
-def test_the_same_seed_gives_the_same_picture_and_another_seed_another(pictures):
+def test_the_same_seed_gives_the_same_code_values_and_another_seed_others(pictures):
+    assert all(picture.dtype == np.float32 and picture.min() >= 0 and picture.max() <= 1 for picture in pictures)
     again = dead_leaves(generator_for(1, "picture 0", "test"), 200, 300)
     assert np.array_equal(again, pictures[0])
     assert not np.array_equal(pictures[0], pictures[1])
-
-
-def test_values_are_code_values_between_0_and_1(pictures):
-    for picture in pictures:
-        assert picture.dtype == np.float32
-        assert picture.min() >= 0
-        assert picture.max() <= 1
 
 
 def test_colours_cover_all_hues_and_nearly_all_saturations_and_values(pictures):
@@ -58,12 +51,3 @@ def test_leaves_are_not_flat(pictures):
         deviation = np.sqrt(np.maximum(cv2.blur(picture**2, (3, 3)) - cv2.blur(picture, (3, 3)) ** 2, 0)).max(axis=2)
         assert (deviation > 1 / 1000).mean() > 0.9
         assert (deviation < 0.1).mean() > 0.6
-
-
-def test_a_picture_of_400x600_takes_a_tenth_of_a_second():
-    seconds = []
-    for i in range(3):
-        start = time.process_time()
-        dead_leaves(generator_for(1, f"timed {i}", "test"), 400, 600)
-        seconds.append(time.process_time() - start)
-    assert min(seconds) < 0.3  # measured 0.03 to 0.09; room for a busy machine

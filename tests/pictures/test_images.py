@@ -47,13 +47,6 @@ def reason(path: Path) -> str:
     return str(caught.value)
 
 
-def test_a_png_is_read_to_the_last_bit(tmp_path, rgb8):
-    Image.fromarray(rgb8).save(tmp_path / "a.png")
-    picture = read_picture(tmp_path / "a.png")
-    assert np.array_equal(picture.pixels, rgb8)
-    assert picture.bits == 8
-
-
 def test_a_16_bit_tiff_keeps_its_16_bits(tmp_path):
     values = np.arange(65536, dtype=np.uint16)[::32][:1800].reshape(20, 30, 3)
     tifffile.imwrite(tmp_path / "deep.tif", values)
@@ -95,17 +88,8 @@ def test_every_exif_orientation_shows_the_same_upright_picture(tmp_path):
         assert np.array_equal(upright(pixels, orientation), blocks), orientation
 
 
-def test_a_jpeg_that_ends_early_is_refused(tmp_path):
-    noise = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
-    Image.fromarray(noise).save(tmp_path / "whole.jpg")
-    content = (tmp_path / "whole.jpg").read_bytes()
-    (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
-    read_picture(tmp_path / "whole.jpg")
-    assert reason(tmp_path / "cut.jpg") == 'cannot be read: JPEG error: Premature end of JPEG file ("cut.jpg")'
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp", ".jp2", ".bmp"])
-def test_any_other_file_that_ends_early_is_refused(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".jp2", ".bmp"])
+def test_a_file_that_ends_early_is_refused(tmp_path, suffix):
     noise = np.random.default_rng(1).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / f"whole{suffix}")
     content = (tmp_path / f"whole{suffix}").read_bytes()
@@ -114,31 +98,27 @@ def test_any_other_file_that_ends_early_is_refused(tmp_path, suffix):
     assert "cannot be read" in reason(tmp_path / f"cut{suffix}")
 
 
-def test_text_named_png_and_an_empty_file_are_refused(tmp_path):
+def test_files_without_a_usable_picture_are_refused_with_the_reason(tmp_path, rgb8):
     (tmp_path / "text.png").write_text("not a picture")
     (tmp_path / "empty.jpg").touch()
-    assert reason(tmp_path / "text.png") == "cannot be read: Not a PNG file"
-    assert reason(tmp_path / "empty.jpg") == 'cannot be read: Empty file "empty.jpg"'
-
-
-def test_grey_is_refused_with_and_without_alpha(tmp_path):
     tifffile.imwrite(tmp_path / "grey.tif", np.zeros((20, 30), np.uint16))
     Image.fromarray(np.zeros((20, 30, 2), np.uint8), "LA").save(tmp_path / "grey_alpha.png")
-    assert reason(tmp_path / "grey.tif").startswith("one channel")
-    assert reason(tmp_path / "grey_alpha.png").startswith("one channel")
-
-
-def test_camera_raw_is_refused_instead_of_taking_its_preview(tmp_path, rgb8):
     tifffile.imwrite(tmp_path / "a.tif", rgb8)
     (tmp_path / "a.tif").rename(tmp_path / "a.dng")  # a DNG is a TIFF whose first picture is a preview
-    assert reason(tmp_path / "a.dng").startswith("camera raw")
-
-
-def test_not_a_number_is_refused(tmp_path):
     values = np.zeros((20, 30, 3), np.float32)
     values[0, 0, 0] = np.nan
     tifffile.imwrite(tmp_path / "nan.tif", values, photometric="rgb")
-    assert reason(tmp_path / "nan.tif") == "1 values are not finite numbers"
+    content = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    chunk = struct.pack(">I4s", 12, b"iCCP") + b"x\0\0not a zlib"[:12]
+    profile = chunk + struct.pack(">I", zlib.crc32(chunk[4:]))
+    (tmp_path / "profile.png").write_bytes(content[:33] + profile + content[33:])
+    for name, words in (
+        ("text.png", "cannot be read: Not a PNG file"), ("empty.jpg", 'cannot be read: Empty file "empty.jpg"'),
+        ("grey.tif", "one channel"), ("grey_alpha.png", "one channel"), ("a.dng", "camera raw"),
+        ("nan.tif", "1 values are not finite numbers"), ("profile.png", "the embedded colour profile is damaged"),
+        ("missing.jpg", 'cannot be read: Could not open file "missing.jpg"'),
+    ):  # fmt: skip
+        assert reason(tmp_path / name).startswith(words)
 
 
 def test_linear_light_in_an_exr_is_encoded_as_srgb(tmp_path):
@@ -153,6 +133,7 @@ def test_linear_light_in_an_exr_is_encoded_as_srgb(tmp_path):
 
 def test_the_same_pixels_have_the_same_hash_in_every_format(tmp_path, rgb8):
     Image.fromarray(rgb8).save(tmp_path / "a.png")
+    assert np.array_equal(read_picture(str(tmp_path / "a.png")).pixels, rgb8)
     Image.fromarray(rgb8).save(tmp_path / "b.bmp")
     tifffile.imwrite(tmp_path / "c.tif", rgb8)
     assert len({read_picture(tmp_path / name).sha256 for name in ("a.png", "b.bmp", "c.tif")}) == 1
@@ -182,13 +163,6 @@ def test_enlarging_stays_within_0_and_1_and_is_refused_beyond_the_limit():
     assert enlarged.max() == 1
     with pytest.raises(UnreadablePicture, match=r"too small: 15x10 pixels would be enlarged 2.00 times"):
         fit(edge, 20, 30, 1.9)
-
-
-def test_writing_a_png_twice_gives_the_same_bytes(tmp_path):
-    rgb = np.random.default_rng(0).random((20, 30, 3), dtype=np.float32)
-    for name in ("a.png", "b.png"):
-        write_png(tmp_path / name, rgb, 16)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
 def test_extensions_name_pictures_and_not_openimageio_s_other_formats():
@@ -292,12 +266,6 @@ def test_an_srgb_profile_keeps_all_16_bits(tmp_path, curve):
     assert values == 600 if curve == "para3" else values < 80  # another curve converts to 8 bits
 
 
-def test_an_srgb_profile_changes_nothing(tmp_path, rgb8):
-    Image.fromarray(rgb8).save(tmp_path / "a.png", icc_profile=matrix_profile("srgb", "para3"))
-    rgb = read_rgb(tmp_path / "a.png").permute(1, 2, 0).numpy()
-    assert np.array_equal(rgb, rgb8.astype(np.float32) / 255)
-
-
 def test_a_profile_made_of_tables_is_followed():
     colours = np.array([[(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (0, 0, 0)]], dtype=np.float32)
     swapped = srgb_from_profile(colours, table_profile_that_swaps_red_and_blue())
@@ -317,25 +285,6 @@ def test_a_profile_made_of_tables_is_followed():
 def test_a_profile_that_cannot_be_used_is_named(rgb8, profile):
     with pytest.raises(UnreadablePicture, match=r"profile cannot be used .*; convert the file to sRGB"):
         srgb_from_profile(rgb8.astype(np.float32) / 255, profile)
-
-
-def test_a_path_may_be_text(tmp_path, rgb8):
-    Image.fromarray(rgb8).save(tmp_path / "a.png")
-    assert read_rgb(str(tmp_path / "a.png")).equal(read_rgb(tmp_path / "a.png"))
-    write_png(str(tmp_path / "b.png"), rgb8 / np.float32(255), 8)
-    assert np.array_equal(read_picture(str(tmp_path / "b.png")).pixels, rgb8)
-    with pytest.raises(UnreadablePicture, match=r'Could not open file "missing.jpg"'):
-        read_rgb("missing.jpg")
-
-
-def test_a_png_whose_profile_is_damaged_is_refused(tmp_path):
-    profile = struct.pack(">I4s", 12, b"iCCP") + b"x\0\0not a zlib"[:12]
-    _, encoded = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))
-    content = encoded.tobytes()
-    chunk = profile + struct.pack(">I", zlib.crc32(profile[4:]))
-    (tmp_path / "a.png").write_bytes(content[:33] + chunk + content[33:])
-    with pytest.raises(UnreadablePicture, match="profile"):
-        read_picture(tmp_path / "a.png")
 
 
 def test_a_picture_of_billions_of_pixels_and_a_name_of_bytes_are_refused(tmp_path, monkeypatch):

@@ -18,18 +18,9 @@ from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import Manifest, read_manifest, split_by_content
 
 CONFIG = IngestConfig(
-    source="folder",
-    root="",
-    limit=None,
-    dead_leaves=3,
-    height=100,
-    width=150,
-    max_upscale=2.0,
-    val_fraction=0.1,
-    test_fraction=0.2,
-    mosaic="90 45 / 135 0",
-    residual_max=0.1,
-)
+    source="folder", root="", limit=None, dead_leaves=3, height=100, width=150, max_upscale=2.0, val_fraction=0.1,
+    test_fraction=0.2, mosaic="90 45 / 135 0", residual_max=0.1,
+)  # fmt: skip
 
 
 def photograph(seed: int, height: int = 110, width: int = 160) -> np.ndarray:
@@ -37,6 +28,14 @@ def photograph(seed: int, height: int = 110, width: int = 160) -> np.ndarray:
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8))
     return np.asarray(coarse.resize((width, height), Image.Resampling.BICUBIC))
+
+
+def folder_of(path: Path, count: int) -> str:
+    """A folder with so many photographs."""
+    path.mkdir()
+    for i in range(count):
+        Image.fromarray(photograph(i)).save(path / f"{i}.png")
+    return str(path)
 
 
 @pytest.fixture
@@ -71,12 +70,8 @@ def test_good_files_come_in_and_bad_ones_are_named(mixed_folder, tmp_path, caplo
     config = dataclasses.replace(CONFIG, root=str(mixed_folder))
     with caplog.at_level(logging.WARNING):
         manifest = ingest(config, 1, tmp_path / "images", map)
-    assert sorted(entry.origin for entry in manifest.pictures) == [
-        "deeper/deep.TIFF",
-        "good.jpg",
-        "rgba.png",
-        "rotated.jpg",
-    ]
+    origins = ["deeper/deep.TIFF", "good.jpg", "rgba.png", "rotated.jpg"]
+    assert sorted(entry.origin for entry in manifest.pictures) == origins
     assert {skipped.file: skipped.reason for skipped in manifest.skipped} == {
         "truncated.jpg": 'cannot be read: JPEG error: Premature end of JPEG file ("truncated.jpg")',
         "text.png": "cannot be read: Not a PNG file",
@@ -87,15 +82,8 @@ def test_good_files_come_in_and_bad_ones_are_named(mixed_folder, tmp_path, caplo
     }
     for skipped in manifest.skipped:
         assert f"skipped {skipped.file}: {skipped.reason}" in caplog.messages
-    assert manifest.counts == {
-        "pictures": 4,
-        "train": 2,
-        "val": 1,
-        "test": 1,
-        "skipped": 5,
-        "ignored_files": 1,
-        "unread_files": 0,
-    }
+    split = {"pictures": 4, "train": 2, "val": 1, "test": 1}
+    assert manifest.counts == split | {"skipped": 5, "ignored_files": 1, "unread_files": 0}
 
 
 def test_what_comes_in_is_right(mixed_folder, tmp_path):
@@ -131,10 +119,8 @@ def test_a_folder_without_any_usable_picture_is_an_error_that_says_what_was_look
     (tmp_path / "pictures" / "text.png").write_text("text")
     (tmp_path / "pictures" / "notes.txt").write_text("text")
     config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"))
-    with pytest.raises(
-        ValueError,
-        match=r"(?s)no picture could be used.*jpg.*found 1 pictures and 1 other files.*text.png: cannot be read",
-    ):
+    words = r"(?s)no picture could be used.*jpg.*found 1 pictures and 1 other files.*text.png: cannot be read"
+    with pytest.raises(ValueError, match=words):
         ingest(config, 1, tmp_path / "images", map)
     assert not (tmp_path / "images").exists()
     with pytest.raises(ValueError, match="expected a folder with pictures"):
@@ -159,10 +145,8 @@ def test_a_limit_takes_the_same_pictures_whatever_they_are_called(tmp_path):
 
 
 def test_fewer_pictures_than_the_limit_are_announced_with_the_split(tmp_path, caplog):
-    (tmp_path / "pictures").mkdir()
-    for i in range(10):
-        Image.fromarray(photograph(i)).save(tmp_path / "pictures" / f"{i}.png")
-    config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"), val_fraction=0.05, test_fraction=0.05)
+    root = folder_of(tmp_path / "pictures", 10)
+    config = dataclasses.replace(CONFIG, root=root, val_fraction=0.05, test_fraction=0.05)
     for limit, messages in ((11, 1), (10, 0)):
         caplog.clear()
         ingest(dataclasses.replace(config, limit=limit), 1, tmp_path / "images", map)
@@ -171,23 +155,10 @@ def test_fewer_pictures_than_the_limit_are_announced_with_the_split(tmp_path, ca
         assert all(message.startswith(split) for message in caplog.messages)
 
 
-def test_ingest_replaces_what_was_there(tmp_path):
-    config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"))
-    (tmp_path / "pictures").mkdir()
-    for i in range(3):
-        Image.fromarray(photograph(i)).save(tmp_path / "pictures" / "a.png")
-        ingest(config, 1, tmp_path / "images", map)
-    assert len(list((tmp_path / "images").glob("*.png"))) == 1
-    assert not (tmp_path / "images.tmp").exists()
-
-
 @pytest.mark.parametrize(("fractions", "empty"), [((0.1, 0.2), ["train"]), ((0.0, 1.0), []), ((1.0, 0.0), [])])
 def test_an_empty_split_is_named_where_pictures_were_asked_for(fractions, empty, tmp_path, caplog):
-    (tmp_path / "pictures").mkdir()
-    for i in range(2):
-        Image.fromarray(photograph(i)).save(tmp_path / "pictures" / f"{i}.png")
-    val, test = fractions
-    config = dataclasses.replace(CONFIG, root=str(tmp_path / "pictures"), val_fraction=val, test_fraction=test)
+    (val, test), root = fractions, folder_of(tmp_path / "pictures", 2)
+    config = dataclasses.replace(CONFIG, root=root, val_fraction=val, test_fraction=test)
     ingest(config, 1, tmp_path / "images", map)
     assert caplog.messages == [f"split {split} is empty, because 2 pictures are too few" for split in empty]
 
@@ -232,22 +203,11 @@ def test_the_lowest_hashes_are_test_and_the_next_val():
     assert splits == ["train", "test", "train", "val", "test"]
 
 
-def test_splits_do_not_depend_on_the_order_of_the_pictures():
-    names = hashes(20)
-    forward = dict(zip(names, split_by_content(names, 0.1, 0.2), strict=True))
-    backward = dict(zip(names[::-1], split_by_content(names[::-1], 0.1, 0.2), strict=True))
-    assert forward == backward
-
-
 def test_one_more_picture_moves_at_most_two_others_to_another_split():
     names = hashes(41)
     before = dict(zip(names[:40], split_by_content(names[:40], 0.1, 0.2), strict=True))
     after = dict(zip(names, split_by_content(names, 0.1, 0.2), strict=True))
     assert sum(before[name] != after[name] for name in before) <= 2
-
-
-def test_no_fraction_means_no_picture():
-    assert set(split_by_content(hashes(9), 0.0, 0.0)) == {"train"}
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from polarnet.pictures.polarimetry import (
     shrink,
     write_intensities,
 )
-from polarnet.simulation.motion import SynthesizeConfig
+from polarnet.simulation.presets import MOTIONS
 from polarnet.simulation.scene import scene_from_intensities
 from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import aolp, dolp, parse_mosaic
@@ -32,18 +32,9 @@ from polarnet.storage.scenes import SceneStore
 SONY = parse_mosaic("90 45 / 135 0")
 ANGLES = (0, 45, 90, 135)
 CONFIG = IngestConfig(
-    source="polarization",
-    root="",
-    limit=None,
-    dead_leaves=0,
-    height=80,
-    width=120,
-    max_upscale=2.0,
-    val_fraction=0.0,
-    test_fraction=0.0,
-    mosaic="90 45 / 135 0",
-    residual_max=0.1,
-)
+    source="polarization", root="", limit=None, dead_leaves=0, height=80, width=120, max_upscale=2.0, val_fraction=0.0,
+    test_fraction=0.0, mosaic="90 45 / 135 0", residual_max=0.1,
+)  # fmt: skip
 
 
 def light(height: int = 40, width: int = 60, degree: float = 0.6, angle_deg: float = 30.0) -> np.ndarray:
@@ -151,22 +142,6 @@ def test_every_angle_of_a_mosaic_is_seen_at_the_centre_of_its_cell(order):
     np.testing.assert_allclose(at_angles, expected, atol=1e-12)
 
 
-def test_an_unpolarized_edge_looks_less_polarized_than_with_one_pixel_per_angle():
-    raw = np.full((40, 40), 0.05)
-    raw[:, 21:] = 0.5  # an edge through cells
-    at_centre = scene_from_intensities(torch.from_numpy(demosaic(raw, SONY)))
-    naive = scene_from_intensities(
-        torch.from_numpy(np.stack([raw[1::2, 1::2], raw[::2, 1::2], raw[::2, ::2], raw[1::2, ::2]]))
-    )
-    assert dolp(at_centre.stokes).max() < 0.6 * dolp(naive.stokes).max()
-
-
-@pytest.mark.parametrize("order", ["0 45 90 135", "0 45 / 90", "0 45 / 90 91", "0 0 / 90 135"])
-def test_a_mosaic_without_the_four_angles_is_refused(order):
-    with pytest.raises(ValueError, match="mosaic: expected the angles 0, 45, 90 and 135"):
-        parse_mosaic(order)
-
-
 def test_what_does_not_belong_together_is_named(tmp_path):
     plane = light()[0]
     for name in ("a_0.png", "a_45.png", "a_90.png", "b_0.png", "b_45.png", "b_90.png", "b_135.png"):
@@ -208,18 +183,10 @@ def test_intensities_survive_the_way_through_their_file(tmp_path):
     assert np.array_equal(valid.numpy(), measured.valid)
 
 
-MOTION = SynthesizeConfig(
-    sequences_per_picture=1,
-    duration_s=0.2,
-    frame_rate_hz=30.0,
-    sensor_height=20,
-    sensor_width=30,
-    speed_min_px_s=30.0,
-    speed_max_px_s=60.0,
+MOTION = dataclasses.replace(
+    MOTIONS["default"], duration_s=0.2, sensor_height=20, sensor_width=30, speed_min_px_s=30.0, speed_max_px_s=60.0,
     acceleration_max_px_s2=2000.0,
-    rotation_max_deg=0.0,
-    zoom_max=1.0,
-)
+)  # fmt: skip
 
 
 def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
@@ -281,18 +248,6 @@ def test_measured_samples_are_taken_with_the_residuals_their_notes_state(shared,
     assert 0.5 < dolp(scene_from_intensities(intensities).stokes)[valid].median() < 0.6  # light reflected by water
     other = ingest(dataclasses.replace(config, mosaic="0 45 / 90 135"), 1, tmp_path / "other", map)
     assert [skipped.file for skipped in other.skipped] == ["carps_IMX250MZR.png"]
-
-
-def test_a_path_may_be_text_and_one_file_needs_no_list(tmp_path):
-    save_npz(tmp_path / "a.npz", light())
-    expected = read_measurement([tmp_path / "a.npz"], SONY)
-    for files in (str(tmp_path / "a.npz"), tmp_path / "a.npz", [str(tmp_path / "a.npz")]):
-        assert np.array_equal(read_measurement(files, SONY).intensities, expected.intensities)
-    write_intensities(str(tmp_path / "b.npz"), expected)
-    assert read_intensities(str(tmp_path / "b.npz"))[1].all()
-    assert group_by_measurement([str(tmp_path / "s_0.png")]) == [(tmp_path / "s_0.png",)]
-    with pytest.raises(UnreadablePicture, match="expected the files of a measurement, got none"):
-        read_measurement([], SONY)
 
 
 def test_a_colour_mosaic_counts_its_green_pixels_where_all_angles_agree():

@@ -8,9 +8,8 @@ import zarr
 from polarnet.cli import main
 from polarnet.recordings.source import RecordingError
 from polarnet.recovery.inputs import rotation_of
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import resting_trajectory
-from polarnet.simulation.polarizers import Grid
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization

@@ -54,11 +54,3 @@ def test_pixels_without_mismatch_give_the_same_events_for_every_seed(model):
     assert len(first) > 10_000
     for other in others:
         assert all(torch.equal(getattr(first, column), getattr(other, column)) for column in "txyp")
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_pixels_without_mismatch_that_see_the_same_fire_alike(model):
-    """All 16 rows see one pattern: each event appears in each row."""
-    events = emulated(moving_light(), 10_000, model, 1, ALIKE)
-    rows = [torch.stack([events.t, events.x.long(), events.p.long()])[:, events.y == row] for row in range(16)]
-    assert all(torch.equal(rows[0], row) for row in rows[1:])

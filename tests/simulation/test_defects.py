@@ -94,29 +94,3 @@ def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
             assert torch.equal(getattr(after, name), getattr(before, name)[alive])
         silent.append(dead)
     assert not np.array_equal(*silent)  # each channel has its own
-
-
-def test_all_pixels_dead_leave_no_event_even_of_hot_ones():
-    columns = constant(dataclasses.replace(QUIET, hot_pixel_share=1.0, dead_pixel_share=1.0), 100.0, 1.0)
-    assert len(columns.t) == 0
-
-
-@pytest.mark.parametrize("model", list(MODELS))
-def test_pieces_threads_and_the_order_of_channels_change_no_event(model):
-    config = dataclasses.replace(
-        SENSORS["default"], model=model, hot_pixel_share=0.1, hot_pixel_rate_hz=500.0, dead_pixel_share=0.1
-    )
-    frames, t_us = bars(), 3333 * torch.arange(12)
-    whole, _ = emulate(frames, t_us, config, key=7)
-    pieces, state = [], None
-    for piece in (slice(0, 1), slice(1, 5), slice(5, 6), slice(6, 12)):
-        events, state = emulate(frames[piece], t_us[piece], config, key=7, state=state)
-        pieces.append(events)
-    turned, _ = emulate(frames.flip(1), t_us, config, key=7, channels=[1, 0], threads=2)
-    for channel, events in enumerate(whole):
-        for name in "txyp":
-            values = getattr(events, name)
-            assert torch.equal(torch.cat([getattr(p[channel], name) for p in pieces]), values)
-            assert torch.equal(getattr(turned[1 - channel], name), values)
-        order = np.lexsort((events.p, events.x, events.y, events.t))
-        assert np.array_equal(order, np.arange(len(events)))

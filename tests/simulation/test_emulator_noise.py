@@ -109,14 +109,6 @@ def test_leak_of_exact_is_the_same_event_for_event_at_any_frame_rate():
     assert np.sort(between_slow) == pytest.approx(np.sort(between_fast), abs=1e-4)
 
 
-def test_leak_rates_spread_over_pixels_by_a_power_of_ten():
-    config = dataclasses.replace(QUIET, leak_rate_hz=1.0, noise_rate_cov_decades=0.1)
-    _, state = emulate(torch.full((1, 1, 100, 100), 9.0), torch.tensor([0]), config, key=5)
-    decades = np.log10(state.pixels[0].leak_nominal / (1e-6 * 0.2))
-    assert decades.mean() == pytest.approx(0, abs=3 * 0.1 / 100)
-    assert decades.std() == pytest.approx(0.1, abs=3 * 0.1 / math.sqrt(2) / 100)
-
-
 def test_uniform_numbers_are_uniform_and_neighbours_are_independent():
     key = np.uint64(12)
     values = np.array([uniform(np.uint64(mixed(key, i))) for i in range(20_000)])

@@ -44,21 +44,6 @@ def test_the_steps_of_8_bits_fire_events_in_groups():
     assert steps.unique(return_counts=True)[1].tolist() == pytest.approx([3] * 10, abs=1)
 
 
-def test_bytes_and_the_same_whole_numbers_in_floating_point_are_the_same_light():
-    whole = np.rint(RAMP_DN)
-    for model in ("exact", "v2e"):
-        events, again = emulated(whole.astype(np.uint8), model), emulated(whole.astype(np.float32), model)
-        assert torch.equal(events.t, again.t)
-        assert torch.equal(events.p, again.p)
-
-
-def test_light_above_255_dn_is_refused_with_the_remedy():
-    with pytest.raises(
-        ValueError, match=r"expected digital numbers in \[0, 255\], got values up to 65535; scale white"
-    ):
-        emulated(np.full(401, 65_535, np.float32))
-
-
 @pytest.mark.parametrize(("dtype", "levels"), [(np.uint8, 16), (np.uint16, 4096)])
 def test_a_photograph_keeps_the_levels_of_its_file(tmp_path, dtype, levels):
     """A sixteenth of the range: 16 levels of 8 bits, 4,096 of 16 bits, all of them different light in the scene."""

@@ -13,27 +13,15 @@ from polarnet.simulation.motion import (
     Sine,
     SynthesizeConfig,
     Trajectory,
-    bilinear,
     frame_times_us,
     random_trajectory,
     render,
-    sensor_to_scene,
 )
+from polarnet.simulation.presets import MOTIONS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.stokes import aolp, dolp, intensities_from_stokes
 
-CONFIG = SynthesizeConfig(
-    sequences_per_picture=1,
-    duration_s=1.0,
-    frame_rate_hz=30.0,
-    sensor_height=120,
-    sensor_width=180,
-    speed_min_px_s=60.0,
-    speed_max_px_s=200.0,
-    acceleration_max_px_s2=800.0,
-    rotation_max_deg=0.0,
-    zoom_max=1.0,
-)
+CONFIG = dataclasses.replace(MOTIONS["default"], sequences_per_picture=1, speed_min_px_s=60.0, speed_max_px_s=200.0)
 STILL = Sine(0.0, 0.0, 0.0)
 
 
@@ -44,15 +32,8 @@ def scene() -> PolarizationScene:
 
 def still(x: float, y: float, roll: float = 0.0, zoom: float = 1.0) -> Trajectory:
     """A window that stays where it is."""
-    return Trajectory(
-        x,
-        y,
-        (STILL,) * 3,
-        (STILL,) * 3,
-        roll=Sine(roll, 0.0, math.pi / 2),
-        zoom=Sine((zoom - 1) / 2, 0.0, math.pi / 2),
-        speed_px_s=0.0,
-    )
+    turn = Sine(roll, 0.0, math.pi / 2), Sine((zoom - 1) / 2, 0.0, math.pi / 2)
+    return Trajectory(x, y, (STILL,) * 3, (STILL,) * 3, *turn, speed_px_s=0.0)
 
 
 def corners(trajectory: Trajectory, config: SynthesizeConfig, t_s: np.ndarray) -> np.ndarray:
@@ -122,12 +103,6 @@ def test_motion_is_mostly_drift_and_seldom_stops():
     assert np.percentile(relative, 1) > 0.1
 
 
-def test_trajectories_of_one_seed_are_the_same_and_of_two_differ():
-    draw = lambda seed: random_trajectory(CONFIG, 400, 600, np.random.default_rng(seed))  # noqa: E731
-    assert draw(1) == draw(1)
-    assert draw(1) != draw(2)
-
-
 def test_a_trajectory_survives_the_way_through_its_vector_to_the_last_bit():
     config = dataclasses.replace(CONFIG, rotation_max_deg=10.0, zoom_max=1.5)
     trajectory = random_trajectory(config, 400, 600, np.random.default_rng(0))
@@ -154,11 +129,6 @@ def test_a_scene_too_small_for_the_window_is_refused():
     rolled = dataclasses.replace(CONFIG, rotation_max_deg=90.0)
     with pytest.raises(ValueError, match="more than 216x216"):  # the sensor's diagonal
         random_trajectory(rolled, 215, 600, np.random.default_rng(0))
-
-
-def test_a_scene_with_too_little_room_for_the_slowest_motion_is_refused():
-    with pytest.raises(ValueError, match="too little room to reach speed_min_px_s=60"):
-        random_trajectory(CONFIG, 122, 182, np.random.default_rng(0))
 
 
 def test_speed_is_lowered_to_what_a_small_scene_allows():
@@ -205,12 +175,6 @@ def test_a_motion_by_whole_pixels_is_an_exact_shift(scene):
     assert torch.equal(first[..., 8:], second[..., :-8])
 
 
-def test_half_way_between_two_pixels_the_window_sees_their_mean(scene):
-    frame = render(scene, still(20.5 + 29 / 2, 10 + 19 / 2), np.zeros(1), 20, 30)[0]
-    left, right = scene.stokes[:, 10:30, 20:50], scene.stokes[:, 10:30, 21:51]
-    torch.testing.assert_close(frame, (left + right) / 2)
-
-
 def test_intensities_of_the_interpolated_light_are_the_interpolated_intensities(scene):
     """Equation 4 is linear in the Stokes vector: it does not matter which is interpolated."""
     trajectory = still(20.3 + 29 / 2, 10.8 + 19 / 2)
@@ -245,17 +209,3 @@ def test_a_roll_by_a_lowers_the_angle_of_polarization_by_a(roll_deg):
 def test_zoom_2_puts_neighbouring_scene_pixels_two_window_pixels_apart(scene):
     frame = render(scene, still(40.0, 30.0, zoom=2.0), np.zeros(1), 21, 31)[0]
     torch.testing.assert_close(frame[:, ::2, 1::2], scene.stokes[:, 25:36, 33:48])
-
-
-def test_the_centre_of_the_window_looks_at_the_pose():
-    left, top, along, across = sensor_to_scene(100.0, 50.0, 0.3, 1.5, 121, 181)
-    assert left + 90 * along - 60 * across == pytest.approx(100)
-    assert top + 90 * across + 60 * along == pytest.approx(50)
-    assert math.hypot(along, across) == pytest.approx(1 / 1.5)
-
-
-def test_bilinear_is_exact_on_a_plane_that_is_one():
-    rows, columns = np.mgrid[:5, :7].astype(np.float32)
-    plane = 2 * columns + 3 * rows
-    for x, y in ((0.0, 0.0), (1.25, 2.5), (6.0, 4.0), (5.75, 3.5)):
-        assert bilinear(plane, x, y) == 2 * x + 3 * y

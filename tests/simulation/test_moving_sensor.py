@@ -8,14 +8,19 @@ import torch
 from skimage import data
 
 from polarnet.events.stream import validate
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import IDEAL, Camera, weights_of
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render, resting_trajectory
-from polarnet.simulation.moving_sensor import emulate_motion, emulate_motion_steps
+from polarnet.simulation.moving_sensor import (
+    channel_light,
+    check_inside,
+    emulate_motion,
+    emulate_motion_steps,
+    lights_of_drift,
+    render_times_us,
+)
 from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.polarizers import IDEAL, weights_of
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import channel_light, check_inside, lights_of_drift, render_times_us
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.stokes import intensities_from_stokes
 
@@ -27,15 +32,8 @@ H, W = 24, 32
 def trajectory(roll: float = 0.0, zoom: float = 0.0, speed: float = 150.0) -> Trajectory:
     """A sensor that swings 20 px to either side, 8 px up and down, and turns and zooms as asked."""
     rest = [STILL] * (HARMONICS - 1)
-    return Trajectory(
-        x=60.3,
-        y=40.7,
-        x_sines=(Sine(20.0, 6.0, 0.3), *rest),
-        y_sines=(Sine(8.0, 9.0, 1.1), *rest),
-        roll=Sine(roll, 5.0, 0.2),
-        zoom=Sine(zoom, 4.0, 0.4),
-        speed_px_s=speed,
-    )
+    x, y = (Sine(20.0, 6.0, 0.3), *rest), (Sine(8.0, 9.0, 1.1), *rest)
+    return Trajectory(60.3, 40.7, x, y, Sine(roll, 5.0, 0.2), Sine(zoom, 4.0, 0.4), speed_px_s=speed)
 
 
 @pytest.fixture(scope="module")
@@ -168,23 +166,3 @@ def test_a_sensor_as_large_as_the_scene_fits_into_it(scene):
     for x, y in ((59.6, 39.5), (59.4, 39.5), (59.5, 39.6), (59.5, 39.4)):
         with pytest.raises(ValueError, match="at 7 us a sensor of 80x120 pixels reaches"):
             check_inside(scene, pose._replace(x=np.array([x]), y=np.array([y])), np.array([7]), 80, 120)
-
-
-def test_exact_needs_few_frames_for_the_times_of_many(scene):
-    config = dataclasses.replace(
-        CONFIG, contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0,
-        cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0,
-        refractory_period_us=0.0,
-    )  # fmt: skip
-    many, few = (
-        emulate_motion(Camera(dataclasses.replace(config, render_rate_hz=rate)), scene, trajectory(), 200_000, (H, W))
-        for rate in (4800.0, 300.0)
-    )
-    errors = []
-    for a, b in zip(few, many, strict=True):
-        assert len(a) == pytest.approx(len(b), rel=0.02)
-        for pixel in range(0, H * W, 7):
-            here, there = ((e.y.long() * W + e.x) == pixel for e in (a, b))
-            if torch.equal(a.p[here], b.p[there]):
-                errors.append((a.t[here] - b.t[there]).abs())
-    assert torch.cat(errors).float().mean() < 250

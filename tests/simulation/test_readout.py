@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events, validate
-from polarnet.simulation.readout import ReadoutConfig, read_out
+from polarnet.simulation.camera import ReadoutConfig, read_out
 
 PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=1000.0, randomise=None)
 
@@ -20,13 +20,6 @@ def events_at(*rows: tuple[int, int, int], height: int = 10, width: int = 10) ->
 
 def triples(events: Events) -> list[tuple[int, int, int]]:
     return list(zip(events.t.tolist(), events.y.tolist(), events.x.tolist(), strict=True))
-
-
-def test_a_perfect_readout_changes_nothing():
-    events = events_at((5, 1, 2), (7, 3, 4))
-    leaving, lost = read_out(events, PERFECT, key=1, duration_us=100)
-    assert leaving is events
-    assert lost == 0
 
 
 def test_each_row_is_late_by_its_number_times_the_latency():

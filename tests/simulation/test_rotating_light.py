@@ -6,12 +6,11 @@ import pytest
 import torch
 
 from polarnet.config.tree import load
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
-from polarnet.simulation.polarizers import Grid
+from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
 from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import behind_polarizers, render_times_us
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
@@ -85,12 +84,9 @@ def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_n
     assert np.diff(adaptive).max() <= 1e6 / 72 + 1
 
 
-def test_leaving_the_scene_is_refused():
+def test_leaving_the_scene_and_a_rate_of_0_are_refused():
     with pytest.raises(ValueError, match="reaches rows"):
         still_events(SENSORS["clean"], uniform_scene(), 100_000, height=5)
-
-
-def test_a_rate_of_0_is_refused():
     with pytest.raises(ValueError, match="rate_hz: expected turns per second other than 0"):
         replace(ROTATING, rate_hz=0.0)
 

@@ -9,23 +9,17 @@ import pytest
 import torch
 
 from polarnet import stokes
-from polarnet.pictures.polarimetry import demosaic
-from polarnet.simulation.camera import Camera
-from polarnet.simulation.motion import Pose, Sine, Trajectory, render_poses
-from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.polarizers import (
+from polarnet.simulation.camera import (
     IDEAL,
     PolarizersConfig,
-    channel_size,
     mixed_with_neighbours,
     split_cells,
     weights_of,
 )
-from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.rendering import channel_light, lights_of_drift
+from polarnet.simulation.motion import Pose, Sine, render_poses
+from polarnet.simulation.moving_sensor import channel_light, lights_of_drift
+from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from polarnet.stokes import parse_mosaic
 
 FILM = dataclasses.replace(IDEAL, extinction_ratio=[100.0] * 4)
 DOFP = dataclasses.replace(IDEAL, layout="dofp")
@@ -126,27 +120,6 @@ def test_each_channel_of_a_mosaic_sees_its_own_pixels():
         torch.testing.assert_close(channel, expected.double(), atol=1e-6, rtol=0)
 
 
-def test_a_mosaic_demosaicked_gives_the_dolp_of_a_scene_that_changes_evenly():
-    """S0 rises along the columns, DoLP along the rows; bilinear interpolation to the centres of cells is then exact.
-
-    Without it, an unpolarized scene would look polarized: S0 changes by 2 % from one pixel of a cell to the next.
-    """
-    rows, columns = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
-    for slope, degree in ((0.01, 0.0), (0.01, 0.02), (-0.01, 0.02)):
-        s0 = 0.5 + slope * (columns - 30)
-        scene = scene_from_polarization(s0, degree * rows, math.radians(40) * torch.ones(40, 60))
-        cells = channels_of(scene, DOFP, still(29.5, 19.5), (40, 60))
-        raw = np.empty((40, 60))
-        for cell, (row, column) in zip(cells.numpy(), [(1, 1), (0, 1), (0, 0), (1, 0)], strict=True):
-            raw[row::2, column::2] = cell
-        centres = degree * (rows[2:-2:2, 2:-2:2].double() + 0.5)
-        interpolated = torch.from_numpy(demosaic(raw, parse_mosaic(DOFP.mosaic)))
-        dolp = stokes.dolp(stokes.stokes_from_intensities(interpolated))
-        torch.testing.assert_close(dolp, centres, atol=1e-5, rtol=0)
-        without = stokes.dolp(stokes.stokes_from_intensities(cells))[1:-1, 1:-1]
-        assert float((without - centres).abs().max()) > 0.01
-
-
 def test_crosstalk_brings_a_fifth_of_the_light_from_four_neighbours():
     frame = np.zeros((1, 5, 5), np.float32)
     frame[0, 2, 2] = 1
@@ -189,20 +162,6 @@ def test_a_drawn_polarizer_never_lets_more_crossed_light_through_than_parallel_l
     assert polarized.max() > 0.2
 
 
-@pytest.mark.parametrize("spread", ["extinction_spread", "angle_spread_deg", "transmission_spread"])
-def test_any_spread_makes_pixels_differ(spread):
-    assert FILM.uniform
-    assert not dataclasses.replace(FILM, **{spread: 0.1}).uniform
-    assert not DOFP.uniform
-
-
-def test_ideal_polarizers_give_the_same_light_alike_or_pixel_by_pixel():
-    scene, pose = random_scene(), still(38.2, 30.7, roll_deg=20)
-    nearly = dataclasses.replace(IDEAL, angle_spread_deg=1e-9)
-    alike, one_by_one = (rendered(scene, pose, (20, 30), polarizers) for polarizers in (IDEAL, nearly))
-    np.testing.assert_allclose(alike, one_by_one, rtol=1e-5, atol=1e-4)
-
-
 def test_a_drifting_sensor_sees_imperfect_polarizers_as_a_turning_one_does():
     scene, pose = random_scene(), still(38.2, 30.7)
     polarizers = dataclasses.replace(FILM, angle_error_deg=[1.0, -2.0, 0.5, 0.0], transmission=[0.8, 0.9, 0.7, 0.8])
@@ -211,14 +170,6 @@ def test_a_drifting_sensor_sees_imperfect_polarizers_as_a_turning_one_does():
         intensity_rows(light, 0, 0, 30, row)
         expected = channels_of(scene, polarizers, pose)[channel]
         torch.testing.assert_close(torch.from_numpy(row.reshape(20, 30)).double() / 255, expected, atol=1e-5, rtol=0)
-
-
-def test_the_channels_of_a_dofp_sensor_have_half_its_rows_and_columns():
-    scene = random_scene()
-    path = Trajectory(39.5, 29.5, (Sine(8.0, 6.0, 0.0),), (Sine(5.0, 4.0, 1.0),), STILL, STILL, 60.0)
-    cells = emulate_motion(Camera(SENSORS["default"], DOFP), scene, path, 200_000, (20, 30))
-    assert [(events.height, events.width) for events in cells] == [(10, 15)] * 4
-    assert all(len(events.t) > 0 for events in cells)
 
 
 @pytest.mark.parametrize(
@@ -234,8 +185,3 @@ def test_the_channels_of_a_dofp_sensor_have_half_its_rows_and_columns():
 def test_polarizers_that_cannot_be_are_refused(change, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         dataclasses.replace(IDEAL, **change)
-
-
-def test_a_mosaic_needs_whole_cells():
-    with pytest.raises(ValueError, match="expected a sensor with even sides, for whole 2x2 cells, got 21x30"):
-        channel_size("dofp", 21, 30)

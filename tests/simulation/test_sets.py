@@ -34,21 +34,9 @@ def images(tmp_path):
     entries = []
     for name, split in (("seen", "train"), ("held-out", "test")):
         write_png(folder / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
-        entries.append(
-            ManifestEntry(
-                name=name,
-                file=f"{name}.png",
-                split=split,
-                source="folder",
-                origin=name,
-                sha256="0" * 64,
-                bits=8,
-                height=100,
-                width=150,
-                source_height=100,
-                source_width=150,
-            )
-        )
+        size = {"height": 100, "width": 150, "source_height": 100, "source_width": 150}
+        origin = {"source": "folder", "origin": name, "sha256": "0" * 64}
+        entries.append(ManifestEntry(name=name, file=f"{name}.png", split=split, bits=8, **origin, **size))
     write_manifest(Manifest(tuple(entries), (), 0, 0), folder)
     return folder
 

@@ -14,7 +14,7 @@ from PIL import Image
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
-from polarnet.pictures.polarimetry import Measurement, write_intensities
+from polarnet.simulation.camera import grid
 from polarnet.simulation.motion import (
     HARMONICS,
     Sine,
@@ -24,7 +24,7 @@ from polarnet.simulation.motion import (
     random_trajectory,
     render,
 )
-from polarnet.simulation.polarizers import grid
+from polarnet.simulation.presets import MOTIONS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
@@ -32,18 +32,10 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 SEQUENCES_PER_PART = 2
-CONFIG = SynthesizeConfig(
-    sequences_per_picture=2,
-    duration_s=0.2,
-    frame_rate_hz=30.0,
-    sensor_height=24,
-    sensor_width=36,
-    speed_min_px_s=60.0,
-    speed_max_px_s=200.0,
-    acceleration_max_px_s2=2000.0,
-    rotation_max_deg=10.0,
-    zoom_max=1.2,
-)
+CONFIG = dataclasses.replace(
+    MOTIONS["default"], sequences_per_picture=2, duration_s=0.2, sensor_height=24, sensor_width=36, speed_min_px_s=60.0,
+    speed_max_px_s=200.0, acceleration_max_px_s2=2000.0, rotation_max_deg=10.0, zoom_max=1.2,
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -61,18 +53,9 @@ def images(tmp_path_factory) -> Path:
         coarse = Image.fromarray(np.random.default_rng(i).integers(0, 256, (6, 8, 3), dtype=np.uint8))
         coarse.resize((120, 80), Image.Resampling.BICUBIC).save(root / "pictures" / f"{i}.png")
     config = IngestConfig(
-        source="folder",
-        root=str(root / "pictures"),
-        limit=None,
-        dead_leaves=0,
-        height=80,
-        width=120,
-        max_upscale=2.0,
-        val_fraction=0.2,
-        test_fraction=0.2,
-        mosaic="90 45 / 135 0",
-        residual_max=0.1,
-    )
+        source="folder", root=str(root / "pictures"), limit=None, dead_leaves=0, height=80, width=120, max_upscale=2.0,
+        val_fraction=0.2, test_fraction=0.2, mosaic="90 45 / 135 0", residual_max=0.1,
+    )  # fmt: skip
     logging.disable(logging.WARNING)
     ingest(config, 1, root / "images", map)
     logging.disable(logging.NOTSET)
@@ -114,29 +97,6 @@ def test_each_training_sequence_over_a_variant_names_its_picture(images, stores,
     variant, picture = next(iter(scenes.variant_of.items()))
     assert scenes.scene_of[variant] == f"{picture}-variant01"
     assert not torch.equal(scenes.read(variant).aolp, scenes.read(f"{picture}-00").aolp)
-
-
-def test_variants_of_photographs_are_mirrored_and_those_of_measured_scenes_are_not(images, tmp_path, project_root):
-    folder = shutil.copytree(images, tmp_path / "images")
-    manifest = read_manifest(folder)
-    first, second = [entry for entry in manifest.pictures if entry.split == "train"][:2]
-    intensities = np.random.default_rng(0).uniform(0.1, 0.5, (4, first.height, first.width)).astype(np.float32)
-    measurement = Measurement(intensities, np.ones(intensities.shape[1:], bool), residual=0.0, saturated=0.0)
-    write_intensities(folder / f"{first.name}.npz", measurement)
-    write_manifest(manifest, folder)
-
-    def degrees(mirrored_share: float) -> dict[str, torch.Tensor]:
-        variation = dataclasses.replace(
-            load(project_root).variation, scenes_per_picture=1, mirrored_share=mirrored_share
-        )
-        paths = [tmp_path / f"{kind}-{mirrored_share}.zarr" for kind in ("scenes", "frames")]
-        synthesize(Synthesis(folder, CONFIG, 1, SEQUENCES_PER_PART, variation), *paths, map)
-        store = SceneStore.open(paths[0])
-        return {entry.name: store.read(f"{entry.name}-variant01-00").dolp for entry in (first, second)}
-
-    plain, mirrored = degrees(0.0), degrees(1.0)
-    assert torch.equal(plain[first.name], mirrored[first.name])
-    assert not torch.equal(plain[second.name], mirrored[second.name])
 
 
 def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path, caplog):
@@ -245,12 +205,6 @@ def test_the_mask_of_a_turning_window_is_that_of_its_weights():
     before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
     assert torch.equal(rendered, before == after)
     assert 0.8 < rendered.float().mean() < 0.98
-
-
-def test_photographs_have_no_mask(stores):
-    scenes, frames = stores
-    assert not scenes.masked
-    assert not frames.masked
 
 
 def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):

@@ -1,10 +1,52 @@
-"""Pixels that may fire in a step, gathered into columns, so that each operation on them is one loop."""
+"""Strips of whole rows that fit the fastest cache, flags on their pixels, and the flagged pixels as columns."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
+from polarnet.simulation.compilation import borrowing, compiled, inlined
+
+STRIP = 4000  # pixels, approximately
+SPARE = 8  # entries that `flagged` may write beyond the pixels of a strip
+
+
+@compiled
+def rows_of_strip(h, w):
+    """Number of rows of a strip."""
+    return min(h, 1 + STRIP // w)
+
+
+@compiled
+def flag_words(pixels):
+    """Flags of pixels, all 0: one byte per pixel, eight bytes to a word."""
+    return np.zeros((pixels + 7) // 8, np.uint64)
+
+
+@compiled
+def flags_of(words, pixels):
+    """Flags of the first `pixels` pixels as a view of bytes, each of which the caller sets to 0 or 1."""
+    words[(pixels - 1) // 8] = 0  # the last strip may leave bytes of this word unset
+    return words.view(np.uint8)[:pixels]
+
+
+@borrowing
+def flagged(words, pixels, positions, groups):
+    """Write the indices of the flags set among the first `pixels` into `positions`; returns their number.
+
+    There is no branch on a flag, because it would be unpredictable. `groups` is scratch. Both arrays need room for
+    `pixels` + SPARE entries.
+    """
+    marked = 0
+    for group in range((pixels + 7) // 8):
+        groups[np.uint64(marked)] = group  # unsigned: numba checks other indices for being negative
+        marked += words[group] != 0
+    flags, count = words.view(np.uint8), 0
+    for m in range(marked):
+        group = groups[m]
+        for j in range(8 * group, 8 * group + 8):
+            positions[np.uint64(count)] = j
+            count += flags[np.uint64(j)]
+    return count
 
 
 class Active(NamedTuple):
@@ -32,14 +74,11 @@ class Active(NamedTuple):
 @compiled
 def empty_active(capacity):
     """Uninitialised arrays for up to `capacity` pixels."""
-    doubles, floats, events = np.empty((7, capacity)), np.empty((4, capacity), np.float32), np.empty(capacity, np.int64)
-    ints, flags = np.empty((3, capacity), np.int32), np.empty((2, capacity), np.uint8)
+    d, f, events = np.empty((7, capacity)), np.empty((4, capacity), np.float32), np.empty(capacity, np.int64)
+    i, b = np.empty((3, capacity), np.int32), np.empty((2, capacity), np.uint8)
     return Active(
-        ints[0], ints[1],
-        doubles[0], doubles[1], doubles[2], doubles[3], doubles[4], doubles[5], doubles[6], events,
-        floats[0], floats[1], floats[2], floats[3], ints[2],
-        flags[0], flags[1],
-    )  # fmt: skip
+        i[0], i[1], d[0], d[1], d[2], d[3], d[4], d[5], d[6], events, f[0], f[1], f[2], f[3], i[2], b[0], b[1]
+    )
 
 
 @inlined

@@ -1,7 +1,6 @@
 """Events of one channel as growing columns, and those of one step, brought into the order (t, y, x, p).
 
-The kernels collect the events of a step pixel by pixel, each as one integer (`event_of`), with its time in whole
-microseconds since the step's start.
+The kernels collect the events of a step pixel by pixel, each as one integer (`event_of`).
 """
 
 import math
@@ -23,13 +22,6 @@ class Columns(NamedTuple):
     x: np.ndarray  # int16, column
     y: np.ndarray  # int16, row
     p: np.ndarray  # int8, +1 or -1
-
-
-class Pending(NamedTuple):
-    """Events of one step in any order."""
-
-    events: np.ndarray  # int64, see `event_of`
-    in_order: np.ndarray  # int64, scratch
 
 
 def empty_columns(capacity: int) -> Columns:
@@ -55,28 +47,17 @@ def _grown(column, used, capacity):
 @compiled
 def with_room(columns, used, more):
     """`columns` if `more` events fit after the first `used`, else a copy of at least twice the size."""
-    if used + more <= columns.t.size:
+    t, x, y, p = columns
+    if used + more <= t.size:
         return columns
-    capacity = max(2 * columns.t.size, used + more)
-    return Columns(
-        _grown(columns.t, used, capacity),
-        _grown(columns.x, used, capacity),
-        _grown(columns.y, used, capacity),
-        _grown(columns.p, used, capacity),
-    )
-
-
-@compiled
-def pending_events(capacity):
-    """Uninitialised arrays for up to `capacity` events of a step."""
-    return Pending(np.empty(capacity, np.int64), np.empty(capacity, np.int64))
+    size = max(2 * t.size, used + more)
+    return Columns(_grown(t, used, size), _grown(x, used, size), _grown(y, used, size), _grown(p, used, size))
 
 
 @compiled
 def roomier(pending):
-    """The same pending events with room for twice as many."""
-    n = pending.events.size
-    return Pending(_grown(pending.events, n, 2 * n), np.empty(2 * n, np.int64))
+    """The same pending events of a step (int64, see `event_of`) with room for twice as many."""
+    return _grown(pending, pending.size, 2 * pending.size)
 
 
 @inlined
@@ -87,25 +68,19 @@ def place_of(y, x):
 
 @inlined
 def event_of(offset_us, place, on):
-    """Pack an event into an int64, so that integers sort by (t, y, x, p).
-
-    From the highest bits: microseconds since a base time (32 bits), row (15), column (15), 1 for ON (1).
-    """
+    """An event as an int64: microseconds since the step's start (32 bits), row (15), column (15), 1 for ON (1)."""
     return np.int64(offset_us) << TIME_SHIFT | place | np.int64(on)
 
 
 @compiled
 def write_in_order(pending, n, start_us, stop_us, columns, used):
-    """Append the n pending events of a step to the first `used` of the columns, in the order (t, y, x, p).
-
-    Returns the columns, enlarged where necessary, and the new number of events.
-    """
+    """Append n pending events of a step to the `used` of the columns in the order (t, y, x, p); return both."""
     base_us = np.int64(math.floor(start_us))
     columns = with_room(columns, used, n)
-    _sort(pending.events[:n], np.int64(math.ceil(stop_us)) - base_us, pending.in_order[:n])
+    in_order = _sorted(pending[:n], np.int64(math.ceil(stop_us)) - base_us)
     t, x, y, p = columns.t[used : used + n], columns.x[used:], columns.y[used:], columns.p[used:]
     for i in range(n):
-        event = pending.in_order[i]
+        event = in_order[i]
         t[i] = base_us + (event >> TIME_SHIFT)
         x[i] = event >> COLUMN_SHIFT & PLACE_MASK
         y[i] = event >> ROW_SHIFT & PLACE_MASK
@@ -139,9 +114,9 @@ def sort_ties(columns, start, stop):
 
 
 @compiled
-def _sort(events, longest_us, in_order):
-    """Sort `events` into `in_order`: by counting over buckets of time, then by insertion within each bucket."""
-    shift = TIME_SHIFT
+def _sorted(events, longest_us):
+    """Sort `events` by counting over buckets of time, then by insertion within each bucket."""
+    in_order, shift = np.empty_like(events), TIME_SHIFT
     while longest_us >> (shift - TIME_SHIFT) >= MAX_BUCKETS:
         shift += 1
     starts = np.zeros((longest_us >> (shift - TIME_SHIFT)) + 2, np.int32)
@@ -162,3 +137,4 @@ def _sort(events, longest_us, in_order):
                 in_order[j] = in_order[j - 1]
                 j -= 1
             in_order[j] = event
+    return in_order

@@ -1,8 +1,7 @@
 """Hot and dead pixels of a channel: hot ones fire at random times whatever their light, dead ones never fire.
 
-Defects are drawn for each channel and apply to the events of every pixel model: both kinds lose their own events. The
-events of a hot pixel are a Poisson process, each ON or OFF with equal probability. A Poisson process has no memory, so
-each span of `SPAN_US` draws its own events, and a clip that is continued needs no state of its hot pixels.
+Both kinds lose the events of their own light. Those of a hot pixel are a Poisson process, which has no memory: each
+span of `SPAN_US` draws its own, so a clip that is continued needs no state of its hot pixels.
 """
 
 import math
@@ -63,12 +62,7 @@ def _chosen(key, purpose, channel, pixels, share):
 
 
 def with_defects(
-    columns: Columns,
-    defects: Defects,
-    width: int,
-    start_us: float,
-    stop_us: float,
-    rounds_up: bool,
+    columns: Columns, defects: Defects, width: int, start_us: float, stop_us: float, rounds_up: bool
 ) -> Columns:
     """The events of a channel without those of its defective pixels and with hot events, in the order (t, y, x, p).
 

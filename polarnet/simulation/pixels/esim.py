@@ -12,10 +12,10 @@ from pydantic import PositiveFloat
 
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import ZERO, compiled
-from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.active import rows_of_strip
+from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.physics import PixelConfig
-from polarnet.simulation.pixels.strips import rows_of_strip
 
 EIGHT_BIT_VIDEO = False
 NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
@@ -64,9 +64,8 @@ def _table(physics):
     """Log intensity of 0 to 255 DN, rounded to float32."""
     table = np.empty(256, np.float32)
     for dn in range(256):
-        table[dn] = math.log(
-            np.float64(np.float32(np.float32(dn) / np.float32(FULL_SCALE)) + np.float32(physics.log_eps))
-        )
+        fraction = np.float32(np.float32(dn) / np.float32(FULL_SCALE))
+        table[dn] = math.log(np.float64(fraction + np.float32(physics.log_eps)))
     return table
 
 
@@ -95,7 +94,7 @@ def advance(light, pixels, steps, columns):
     times_us, h, w = steps.times_us, steps.height, steps.width
     rows, table, used = rows_of_strip(h, w), _table(steps.physics), ZERO
     strip = np.empty((2, rows * w), np.float32)
-    pending = pending_events(h * w)
+    pending = np.empty(h * w, np.int64)
     for k in range(times_us.size - 1):
         n = ZERO
         for y in range(0, h, rows):
@@ -124,7 +123,7 @@ def _fire(pixels, steps, k, y, logarithm, pending, n):
         if (after - reference) * sign < threshold * NEARLY:
             continue
         crossed = _levels(before, after, reference, sign, threshold)
-        while n + crossed > pending.events.size:
+        while n + crossed > pending.size:
             pending = roomier(pending)
         place, level = place_of(y, x), reference
         for _ in range(crossed):
@@ -132,7 +131,7 @@ def _fire(pixels, steps, k, y, logarithm, pending, n):
             event_us = start_us + dt * _crossing(before, after, level)
             if event_us - pixels.last_event_us[i] >= physics.refractory_us:
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
-                pending.events[n] = event_of(offset_us, place, on)
+                pending[n] = event_of(offset_us, place, on)
                 pixels.last_event_us[i] = event_us
                 n += 1
         pixels.reference[i] = level
@@ -152,6 +151,6 @@ def _levels(before, after, reference, sign, threshold):
 @compiled
 def _crossing(before, after, level):
     """When a level is met, as a fraction of the time between two frames; 0 for a pixel at rest."""
-    return (
-        (np.float64(level) - np.float64(before)) / (np.float64(after) - np.float64(before)) if after != before else 0.0
-    )
+    if after == before:
+        return 0.0
+    return (np.float64(level) - np.float64(before)) / (np.float64(after) - np.float64(before))

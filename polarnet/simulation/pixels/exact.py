@@ -12,21 +12,20 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
+from polarnet.simulation.pixels import active as strips
 from polarnet.simulation.pixels import physics, randomness
-from polarnet.simulation.pixels.active import empty_active, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.active import SPARE, empty_active, flagged, gather, keep_continuing, scatter
+from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows, linlog
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,
     SATURATION,
     Physics,
-    leak_factor_map,
+    mismatch,
     shot_noise_fraction,
-    threshold_maps,
 )
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
-from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 
 EIGHT_BIT_VIDEO = False
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
@@ -72,35 +71,19 @@ class Step(NamedTuple):
     has_shots: bool  # whether a shot-noise candidate of any pixel falls into the step
 
 
-class Moved(NamedTuple):
-    """A strip of pixels that moved through a step as if nothing fired."""
-
-    first: int  # number of the strip's first pixel
-    before: np.ndarray  # float32, change at the start of the step
-    rise: np.ndarray  # float32, rise of the filtered log intensity
-    words: np.ndarray  # uint64, flags of the pixels that may fire
-
-
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
-    threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
-    leak_factor = leak_factor_map(physics, n, key, channel)
-    zeros = np.zeros(n, np.float32)
+    threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
+    change, dn, response, lag, leak = np.zeros((5, n), np.float32)
     return Pixels(
-        change=zeros,
-        dn=zeros.copy(),
-        linlog=zeros.copy(),
-        lag=zeros.copy(),
-        buffer_lag=zeros[: n if physics.source_follower_hz > 0 else 0].copy(),
-        threshold_on=threshold_on,
-        threshold_off=threshold_off,
-        leak_nominal=np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
-        leak=zeros.copy(),
-        last_event_us=np.full(n, LONG_AGO_US),
-        events=np.zeros(n, np.int32),
-        next_shot_us=np.full(n, np.inf),
-    )
+        change, dn, response, lag,
+        np.zeros(n if physics.source_follower_hz > 0 else 0, np.float32),
+        threshold_on, threshold_off,
+        np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
+        leak,
+        np.full(n, LONG_AGO_US), np.zeros(n, np.int32), np.full(n, np.inf),
+    )  # fmt: skip
 
 
 @compiled
@@ -119,56 +102,47 @@ def start(light, pixels, steps):
             if pixels.leak[i] > 0:
                 pixels.last_event_us[i] = time_us - pixels.change[i] / pixels.leak[i]
         if physics.shot_noise_rate_hz > 0:
-            threshold_on, threshold_off = pixels.threshold_on[i], pixels.threshold_off[i]
-            pixels.next_shot_us[i] = time_us + _until_next_shot(
-                physics, shot_key, i, time_us, threshold_on, threshold_off
-            )
+            on, off = pixels.threshold_on[i], pixels.threshold_off[i]
+            pixels.next_shot_us[i] = time_us + _until_next_shot(physics, shot_key, i, time_us, on, off)
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
-    rows = rows_of_strip(h, w)
-    strip = np.empty((4, rows * w), np.float32)
-    words = flag_words(rows * w)
+    rows = strips.rows_of_strip(h, w)
+    strip, words = np.empty((4, rows * w), np.float32), strips.flag_words(rows * w)
     active = empty_active(BATCH + rows * w + SPARE)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
-    pending = pending_events(h * w)
+    pending = np.empty(h * w, np.int64)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
     used = ZERO
     for k in range(times_us.size - 1):
-        start_us, stop_us = times_us[k], times_us[k + 1]
-        has_shots = soonest_us.min() < stop_us
-        step = Step(
-            physics, start_us, stop_us, stop_us - start_us, physics.refractory_s * 1e6, jitter, leak_key, shot_key,
-            has_shots,
-        )  # fmt: skip
+        start_us, stop_us, dt_us = times_us[k], times_us[k + 1], times_us[k + 1] - times_us[k]
+        has_shots, refractory_us = soonest_us.min() < stop_us, physics.refractory_s * 1e6
+        step = Step(physics, start_us, stop_us, dt_us, refractory_us, jitter, leak_key, shot_key, has_shots)
         n, count = ZERO, ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
             rise, before = strip[2, : stop - first], strip[3, : stop - first]
+            dn_before, response_before = pixels.dn[first:stop], pixels.linlog[first:stop]
             intensity_rows(light, steps.first_frame + k, y, w, dn)
             linlog(dn, response)
             if physics.cutoff_hz > 0:
-                rate = np.float32(2e-6 * math.pi * physics.cutoff_hz * (stop_us - start_us) / SATURATION)
-                _filter(
-                    dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], pixels.lag[first:stop], rate, rise
-                )
+                rate = np.float32(2e-6 * math.pi * physics.cutoff_hz * dt_us / SATURATION)
+                _filter(dn, response, dn_before, response_before, pixels.lag[first:stop], rate, rise)
             else:
-                _difference(dn, response, pixels.dn[first:stop], pixels.linlog[first:stop], rise)
+                _difference(dn, response, dn_before, response_before, rise)
             if physics.source_follower_hz > 0:
-                _buffer(
-                    rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * step.duration_us
-                )
-            fires = flags_of(words, stop - first)
-            _move(pixels, first, rise, np.float32(stop_us - start_us), before, fires)
+                _buffer(rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * dt_us)
+            fires = strips.flags_of(words, stop - first)
+            _move(pixels, first, rise, np.float32(dt_us), before, fires)
             if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            count = _activate(pixels, Moved(first, before, rise, words), step, active, count)
+            count = _activate(pixels, first, before, rise, words, step, active, count)
             if count >= BATCH or y + rows >= h:
                 pending, n = _fire(pixels, step, active, count, w, pending, n)
                 count = ZERO
@@ -247,15 +221,18 @@ def _flag_shots(next_shot_us, stop_us, fires):
 
 
 @borrowing
-def _activate(pixels, strip, step, active, count):
-    """Append the flagged pixels of a strip to the `count` active ones; returns their new number."""
+def _activate(pixels, first, before, rise, words, step, active, count):
+    """Append the flagged pixels of the strip that begins at pixel `first` to the `count` active ones; returns `count`.
+
+    `before` is the change at the start of the step, `rise` the rise of the filtered log intensity.
+    """
     pixel, index = active.pixel[count:], active.scratch[count:]
-    stop = count + flagged(strip.words, strip.before.size, index, pixel)
+    stop = count + flagged(words, before.size, index, pixel)
     pixel, index = active.pixel[count:stop], active.scratch[count:stop]
     for a in range(stop - count):
-        pixel[a] = strip.first + index[a]
-    gather(strip.before, index, active.change[count:stop])
-    gather(strip.rise, index, active.slope[count:stop])
+        pixel[a] = first + index[a]
+    gather(before, index, active.change[count:stop])
+    gather(rise, index, active.slope[count:stop])
     gather(pixels.threshold_on, pixel, active.threshold_on[count:stop])
     gather(pixels.threshold_off, pixel, active.threshold_off[count:stop])
     gather(pixels.leak, pixel, active.leak[count:stop])
@@ -272,13 +249,13 @@ def _activate(pixels, strip, step, active, count):
 
 @compiled
 def _fire(pixels, step, active, count, width, pending, n):
-    """Follow the active pixels through a step, in rounds: in each round, a pixel fires at most once.
+    """Follow the active pixels through a step, in rounds in which each pixel fires at most once.
 
-    Rounds instead of one pixel after another, and selections instead of branches, because the branch is unpredictable.
-    Returns the pending events and their number.
+    Rounds and selections instead of branches, because the branch is unpredictable. Returns the pending events and
+    their number.
     """
     while count > 0:
-        while n + count > pending.events.size:
+        while n + count > pending.size:
             pending = roomier(pending)
         n, count = _fire_once(pixels, step, active, count, width, pending, n)
     return pending, n
@@ -325,11 +302,8 @@ def _insert_shots(pixels, step, active, count):
     for a in range(count):
         i = active.pixel[a]
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-        shot, limit = (
-            pixels.next_shot_us[i] - step.start_us,
-            active.next_now[a] if active.fires[a] else step.duration_us,
-        )
-        replaced = False
+        limit = active.next_now[a] if active.fires[a] else step.duration_us
+        shot, replaced = pixels.next_shot_us[i] - step.start_us, False
         while shot < limit and not replaced:
             shot_us = step.start_us + shot
             accepted, is_on = _shot(step.physics, step.shot_key, i, shot_us, on, off, pixels.dn[i])
@@ -370,7 +344,7 @@ def _append_events(active, count, width, start_us, pending, n):
         place = place_of(y, active.pixel[a] - y * width)
         active.event[a] |= event_of(since_whole_us + active.next_now[a], place, 0)
     for a in range(count):
-        pending.events[np.uint64(n)] = active.event[a]  # overwritten by the next if the pixel does not fire
+        pending[np.uint64(n)] = active.event[a]  # overwritten by the next if the pixel does not fire
         n += active.fires[a]
     return n
 
@@ -396,9 +370,8 @@ def _bits(key, i, time_us):
 @compiled
 def _jittered_leak(nominal, jitter, key, i, number):
     """Leak of pixel i from event `number` to the next."""
-    return nominal * np.float32(
-        max(1 - jitter * rough_normal(mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))), 0.0)
-    )
+    bits = mixed(key, (np.uint64(i) << np.uint64(32)) + np.uint64(number))
+    return nominal * np.float32(max(1 - jitter * rough_normal(bits), 0.0))
 
 
 @compiled

@@ -1,7 +1,4 @@
-"""Light on the pixels of one channel, row by row, and the pixels' response to it.
-
-Light is in digital numbers (DN): 0 is dark, 255 the brightest value of a picture.
-"""
+"""Light on the pixels of one channel in digital numbers (DN, 255: a picture's brightest value), and the response."""
 
 import math
 from typing import NamedTuple
@@ -79,20 +76,10 @@ def linlog_as_v2e(dn, linlog):
 
 # ln(1 + x) = x - x^2 / 2 + x^3 P(x) for 1 + x in [sqrt(1/2), sqrt(2)], and ln 2 in two parts (Cephes' logf); P is
 # evaluated in pairs (Estrin's scheme)
-LOG_POLYNOMIAL = tuple(
-    np.float32(c)
-    for c in (
-        7.0376836292e-2,
-        -1.1514610310e-1,
-        1.1676998740e-1,
-        -1.2420140846e-1,
-        1.4249322787e-1,
-        -1.6668057665e-1,
-        2.0000714765e-1,
-        -2.4999993993e-1,
-        3.3333331174e-1,
-    )
-)
+LOG_POLYNOMIAL = tuple(map(np.float32, (
+    7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1,
+    -1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1,
+)))  # fmt: skip
 LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 SQRT_HALF_BITS, MANTISSA_BITS = np.int32(0x3F3504F3), np.int32(23)
 KNEE_32, SLOPE_32 = np.float32(KNEE), np.float32(math.log(KNEE) / KNEE)

@@ -4,7 +4,6 @@ Formulas and constants are those of v2e (Hu, Liu, Delbruck, CVPRW 2021).
 """
 
 import math
-from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -37,9 +36,7 @@ class PixelConfig:
     source_follower_hz: NonNegativeFloat
     """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
 
-    Photoreceptor and source follower are stages of the pixel's circuit (Lichtsteiner, Posch, Delbruck, JSSC 2008), and
-    together a second-order low-pass. One pole is what v2e has: its code (`low_pass_filter` of
-    v2ecore/emulator_utils.py) says that it was of second order once, and that "one pole is nearly always dominant".
+    Photoreceptor and source follower are together a second-order low-pass (Lichtsteiner et al., JSSC 2008).
     """
     leak_rate_hz: NonNegativeFloat
     """ON events per second of a pixel that sees no change."""
@@ -71,55 +68,38 @@ class Physics(NamedTuple):
 
 def physics_of(config: PixelConfig) -> Physics:
     """The parameters of `config`, with the refractory period in seconds."""
-    return Physics(
-        config.contrast_threshold_on,
-        config.contrast_threshold_off,
-        config.contrast_threshold_sigma_on,
-        config.contrast_threshold_sigma_off,
-        config.contrast_threshold_correlation,
-        config.cutoff_hz,
-        config.source_follower_hz,
-        config.leak_rate_hz,
-        config.leak_jitter,
-        config.noise_rate_cov_decades,
-        config.shot_noise_rate_hz,
-        config.refractory_period_us * 1e-6,
-    )
+    values = {name.removeprefix("contrast_"): value for name, value in vars(config).items()}
+    values["refractory_s"] = config.refractory_period_us * 1e-6
+    return Physics(*(values[name] for name in Physics._fields))
 
 
-def threshold_maps(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray]:
-    """ON and OFF thresholds of the pixels of a channel, float32: normally distributed, at least `THRESHOLD_FLOOR`."""
+def mismatch(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ON and OFF thresholds of a channel's pixels, and their leak rates relative to the nominal rate, float32.
 
-    def deviations_on() -> np.ndarray:
-        return randomness.normal_map(key, randomness.THRESHOLD_ON, channel, pixels)
-
-    def deviations_off() -> np.ndarray:
-        share, own = (
-            physics.threshold_correlation,
-            randomness.normal_map(key, randomness.THRESHOLD_OFF, channel, pixels),
-        )
-        return np.float32(share) * deviations_on() + np.float32(math.sqrt(1 - share * share)) * own if share else own
-
+    Thresholds are normally distributed, at least `THRESHOLD_FLOOR`; leak rates log-normally.
+    """
+    share, sigma_on, sigma_off = physics.threshold_correlation, physics.threshold_sigma_on, physics.threshold_sigma_off
+    on = off = np.zeros(pixels, np.float32)
+    if sigma_on or (sigma_off and share):
+        on = randomness.normal_map(key, randomness.THRESHOLD_ON, channel, pixels)
+    if sigma_off:
+        off = randomness.normal_map(key, randomness.THRESHOLD_OFF, channel, pixels)
+    if share:
+        off = np.float32(share) * on + np.float32(math.sqrt(1 - share * share)) * off
+    exponents = np.zeros(pixels, np.float32)
+    if cov_decades := physics.noise_rate_cov_decades:
+        exponents = np.float32(cov_decades) * randomness.normal_map(key, randomness.NOISE_RATE, channel, pixels)
     return (
-        _threshold_map(physics.threshold_on, physics.threshold_sigma_on, deviations_on, pixels),
-        _threshold_map(physics.threshold_off, physics.threshold_sigma_off, deviations_off, pixels),
+        _threshold_map(physics.threshold_on, sigma_on, on),
+        _threshold_map(physics.threshold_off, sigma_off, off),
+        (10 ** exponents.astype(np.float64)).astype(np.float32),  # powers in float32 depend on the processor
     )
 
 
-def _threshold_map(nominal: float, sigma: float, deviations: Callable[[], np.ndarray], pixels: int) -> np.ndarray:
+def _threshold_map(nominal: float, sigma: float, deviations: np.ndarray) -> np.ndarray:
     if sigma == 0:
-        return np.full(pixels, nominal, np.float32)
-    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations(), np.float32(THRESHOLD_FLOOR))
-
-
-def leak_factor_map(physics: Physics, pixels: int, key: np.uint64, channel: int) -> np.ndarray:
-    """Leak rates of the pixels of a channel relative to the nominal rate, float32: log-normally distributed."""
-    cov_decades = physics.noise_rate_cov_decades
-    if cov_decades == 0:
-        return np.ones(pixels, np.float32)
-    exponents = randomness.normal_map(key, randomness.NOISE_RATE, channel, pixels)
-    decades = (np.float32(cov_decades) * exponents).astype(np.float64)  # powers in float32 depend on the processor
-    return (10**decades).astype(np.float32)
+        return np.full(len(deviations), nominal, np.float32)
+    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations, np.float32(THRESHOLD_FLOOR))
 
 
 @inlined

@@ -11,18 +11,11 @@ import numpy as np
 
 from polarnet.simulation.compilation import ONE, ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
+from polarnet.simulation.pixels.active import SPARE, flag_words, flagged, flags_of, rows_of_strip
 from polarnet.simulation.pixels.columns import first_tied, sort_ties, with_room
 from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
-from polarnet.simulation.pixels.physics import (
-    DARK_OFFSET,
-    SATURATION,
-    Physics,
-    leak_factor_map,
-    shot_noise_fraction,
-    threshold_maps,
-)
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, Physics, mismatch, shot_noise_fraction
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals, uniform
-from polarnet.simulation.pixels.strips import SPARE, flag_words, flagged, flags_of, rows_of_strip
 
 EIGHT_BIT_VIDEO = True
 NEARLY = np.float32(1.000001)  # enlarges changes by more than rounding in a first test; `_count` then counts exactly
@@ -66,30 +59,14 @@ class Firing(NamedTuple):
     candidates: np.ndarray  # int32 [2, pixels of a strip + SPARE], scratch
 
 
-class Slot(NamedTuple):
-    """One of the times in a step at which pixels may fire."""
-
-    number: int  # from 1
-    t_us: np.int64
-    stamp: np.float32  # the same time in seconds
-    least: np.float32  # seconds since the last event of a pixel, which the next must exceed
-    refractory: bool  # whether the refractory period can suppress an event of this step
-
-
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
     real = np.float64 if physics.cutoff_hz > 0 or physics.source_follower_hz > 0 else np.float32
-    threshold_on, threshold_off = threshold_maps(physics, n, key, channel)
-    return Pixels(
-        memory=np.zeros(n, real),
-        filtered=np.zeros(n, real),
-        photoreceptor=np.zeros(n if physics.source_follower_hz > 0 else 0, np.float64),
-        threshold_on=threshold_on,
-        threshold_off=threshold_off,
-        leak_factor=leak_factor_map(physics, n, key, channel),
-        refractory_since=np.full(n, -physics.refractory_s, np.float32),
-    )
+    threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
+    photoreceptor = np.zeros(n if physics.source_follower_hz > 0 else 0)
+    since = np.full(n, -physics.refractory_s, np.float32)
+    return Pixels(np.zeros(n, real), np.zeros(n, real), photoreceptor, threshold_on, threshold_off, leak_factor, since)
 
 
 @borrowing
@@ -106,10 +83,9 @@ def start(light, pixels, steps):
     """Set low-pass and memory to the first frame; nothing fires."""
     dn, linlog = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
     _respond(light, ZERO, ZERO, steps.width, dn, linlog)
-    pixels.filtered[:] = linlog
+    pixels.filtered[:] = pixels.memory[:] = linlog
     if pixels.photoreceptor.size:
         pixels.photoreceptor[:] = linlog
-    pixels.memory[:] = linlog
 
 
 @compiled
@@ -118,10 +94,8 @@ def advance(light, pixels, steps, columns):
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip = np.empty((3, rows * w), np.float32)
-    firing = Firing(
-        np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32),
-        flag_words(rows * w), np.empty((2, rows * w + SPARE), np.int32),
-    )  # fmt: skip
+    entries, order = np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32)
+    firing = Firing(entries, order, flag_words(rows * w), np.empty((2, rows * w + SPARE), np.int32))
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     max_share = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
@@ -129,9 +103,8 @@ def advance(light, pixels, steps, columns):
     for k in range(times_us.size - 1):
         number = steps.first_number + k
         dt = (times_us[k + 1] - times_us[k]) * 1e-6
-        step = Step(
-            physics, times_us[k], times_us[k + 1], dt, mixed(leak_key, number), mixed(shot_key, number), max_share
-        )
+        keys = mixed(leak_key, number), mixed(shot_key, number)
+        step = Step(physics, times_us[k], times_us[k + 1], dt, keys[0], keys[1], max_share)
         n, most = ZERO, ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
@@ -183,12 +156,8 @@ def _buffer(photoreceptor, filtered, share):
 @borrowing
 def _leak(memory, threshold_on, leak_factor, noise, dt, physics):
     """Lower each memory by the leak of the reset switch, which makes a dark, motionless scene fire ON events."""
-    one, dt, rate, jitter = (
-        np.float32(1),
-        np.float32(dt),
-        np.float32(physics.leak_rate_hz),
-        np.float32(physics.leak_jitter),
-    )
+    one, dt = np.float32(1), np.float32(dt)
+    rate, jitter = np.float32(physics.leak_rate_hz), np.float32(physics.leak_jitter)
     for j in range(memory.size):
         memory[j] -= dt * (rate * leak_factor[j] * (one - jitter * noise[j])) * threshold_on[j]
 
@@ -251,40 +220,38 @@ def _emit(pixels, step, firing, n, most, columns, used):
     for number in range(1, most + 1):
         t_us = np.int64(np.rint(start_us + (stop_us - start_us) * number / most))
         # torch.linspace, which v2e calls, counts from both ends
-        stamp = (
-            first + interval * np.float32(number - 1)
-            if number <= most // 2
-            else last - interval * np.float32(most - number)
-        )
+        early = number <= most // 2
+        stamp = first + interval * np.float32(number - 1) if early else last - interval * np.float32(most - number)
         columns = with_room(columns, used, active + 1)
-        slot = Slot(number, t_us, stamp, least, refractory)
-        written, active = _emit_slot(pixels, firing, active, slot, columns, used)
+        written, active = _emit_slot(pixels, firing, active, number, t_us, stamp, least, columns, used)
         used += written
     _consume(pixels, firing.entries, n)
     return columns, used
 
 
 @borrowing
-def _emit_slot(pixels, firing, active, slot, columns, used):
-    """Append the events of one slot; returns their number, and how many pixels have events left.
+def _emit_slot(pixels, firing, active, number, t_us, stamp, least, columns, used):
+    """Append the events of slot `number` (from 1) at `t_us`; returns their number, and of pixels with events left.
 
-    The columns have room for one event more than there are active pixels.
+    `stamp` is the same time in seconds. Pixels fire if it exceeds their last event's by more than `least`, -infinity if
+    the refractory period cannot suppress an event. The columns have room for one event more than active pixels.
     """
+    refractory = least >= np.float32(0)
     entries, order, since = firing.entries, firing.order, pixels.refractory_since
     t, x, y, p = columns.t[used:], columns.x[used:], columns.y[used:], columns.p[used:]
     written, remaining = 0, 0
     for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
         e, at = np.uint64(order[a]), np.uint64(written)
         i, place, crossed = np.uint64(entries[e, PIXEL]), entries[e, PLACE], entries[e, CROSSED]
-        accepted = np.float32(slot.stamp - since[i]) > slot.least
-        if slot.refractory:
-            since[i] = slot.stamp if accepted else since[i]
+        accepted = np.float32(stamp - since[i]) > least
+        if refractory:
+            since[i] = stamp if accepted else since[i]
         polarity = np.int32(1) if crossed > 0 else np.int32(-1)
-        t[at], x[at], y[at], p[at] = slot.t_us, place & 0xFFFF, place >> 16, polarity
+        t[at], x[at], y[at], p[at] = t_us, place & 0xFFFF, place >> 16, polarity
         entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
         written += int(accepted)
         order[np.uint64(remaining)] = e
-        remaining += abs(crossed) > slot.number
+        remaining += abs(crossed) > number
     return written, remaining
 
 

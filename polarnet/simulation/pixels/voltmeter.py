@@ -1,7 +1,6 @@
 """The pixel model `dvs_voltmeter` (Lin et al., ECCV 2022): a voltage in Brownian motion with drift between thresholds.
 
-All constants are the paper's, in microseconds and thresholds: an event fires when the voltage has moved by 1. Signal
-and noise are one process, so every event has the label SIGNAL.
+All constants are the paper's, in microseconds and thresholds: an event fires when the voltage has moved by 1.
 """
 
 import math
@@ -12,7 +11,7 @@ import numpy as np
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.columns import event_of, pending_events, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
@@ -52,15 +51,6 @@ class Pixels(NamedTuple):
     voltage: np.ndarray  # float64, change since the last event, in thresholds
 
 
-class Step(NamedTuple):
-    """One step of a channel."""
-
-    physics: Physics
-    start_us: float
-    duration_us: float
-    key: np.uint64
-
-
 def physics_of(config: VoltmeterConfig) -> Physics:
     """The constants of the configured camera."""
     return CAMERAS[config.voltmeter_camera]
@@ -82,21 +72,20 @@ def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     times_us, h, w = steps.times_us, steps.height, steps.width
     passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), ZERO, np.empty(w, np.float32)
-    pending = pending_events(h * w)
+    pending = np.empty(h * w, np.int64)
     for k in range(times_us.size - 1):
         n, key = ZERO, mixed(passage_key, steps.first_number + k)
-        step = Step(steps.physics, times_us[k], times_us[k + 1] - times_us[k], key)
         for y in range(h):
             intensity_rows(light, steps.first_frame + k, y, w, dn)
-            pending, n = _walk(pixels, step, y, dn, pending, n)
+            pending, n = _walk(pixels, steps, k, key, y, dn, pending, n)
         columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
     return columns, used
 
 
 @compiled
-def _walk(pixels, step, y, dn, pending, n):
-    """Move the voltages of row y from threshold to threshold through a step; return the pending events and number."""
-    physics, start_us, dt = step.physics, step.start_us, step.duration_us
+def _walk(pixels, steps, k, key, y, dn, pending, n):
+    """Move the voltages of row y from threshold to threshold through step k; return the pending events and number."""
+    physics, start_us, dt = steps.physics, steps.times_us[k], steps.times_us[k + 1] - steps.times_us[k]
     base_us = math.floor(start_us)
     for x in range(dn.size):
         i = y * dn.size + x
@@ -104,20 +93,19 @@ def _walk(pixels, step, y, dn, pending, n):
         mean = (before + after) / 2
         drift = physics.k1 * (after - before) / dt / (mean + physics.k2) + physics.k4 + physics.k5 * mean
         noise = physics.k3 * math.sqrt(mean) / (mean + physics.k2) + physics.k6
-        pixel_key, draw, now, voltage, place = mixed(step.key, i), 0, 0.0, pixels.voltage[i], place_of(y, x)
+        pixel_key, draw, now, voltage, place = mixed(key, i), 0, 0.0, pixels.voltage[i], place_of(y, x)
         while True:
             on = uniform(mixed(pixel_key, draw)) < chance_of_on(drift, noise, 1 - voltage, 1 + voltage)
             distance = 1 - voltage if on else 1 + voltage
-            wait = first_passage(
-                distance, drift if on else -drift, noise, mixed(pixel_key, draw + 1), mixed(pixel_key, draw + 2)
-            )
+            along = drift if on else -drift
+            wait = first_passage(distance, along, noise, mixed(pixel_key, draw + 1), mixed(pixel_key, draw + 2))
             draw += DRAWS
             if not now + wait < dt:
                 break
             now, voltage = now + wait, 0.0
-            if n == pending.events.size:
+            if n == pending.size:
                 pending = roomier(pending)
-            pending.events[n] = event_of(np.int64(start_us - base_us + now), place, on)
+            pending[n] = event_of(np.int64(start_us - base_us + now), place, on)
             n += 1
         pixels.voltage[i] = voltage + (distance if on else -distance) * (dt - now) / wait
         pixels.dn[i] = dn[x]

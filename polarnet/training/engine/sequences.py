@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from polarnet.events.representations import Encode
-from polarnet.events.windows import encode_windows
+from polarnet.events.streaming import encode_windows
 from polarnet.runtime.machine import generator_for, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
-from polarnet.simulation.fly import EmulatedEvents
+from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 

@@ -17,7 +17,7 @@ from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.fly import EmulatedEvents
+from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.groups import is_url
