@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import torch
@@ -13,8 +12,7 @@ from torch import Tensor, nn
 from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, Setup, State, each_map, weights_file
-from polarnet.methods.two_threads import Sharing
+from polarnet.methods.method import Recoverer, Setup, State, each_map, weights_file, windows_at_once
 from polarnet.methods.window_length import of_any_length
 from polarnet.networks.base.checkpoint import trained_window_us
 from polarnet.networks.polarnet.stokes_unet import MAX_BINNING, Binning, StokesUNet
@@ -50,8 +48,7 @@ def dolp_recoverer(
 ) -> Recoverer:
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
 
-    `precision` is fp32 or bf16 (autocast). Two threads share runs of many windows (`polarnet.methods.two_threads`).
-    Windows may have any length (`polarnet.methods.window_length`). `thresholds` are the camera's contrast thresholds,
+    `precision` is fp32 or bf16 (autocast). Windows may have any length. `thresholds` are the camera's contrast thresholds,
     ON and OFF (`told`), and `binning` is the side of the pixel blocks that the network sees (default: that of its
     training).
     """
@@ -66,20 +63,16 @@ def dolp_recoverer(
     def autocast() -> torch.autocast:
         return torch.autocast(place.type, torch.bfloat16, enabled=precision == "bf16")
 
-    def encode_on_device(windows: Sequence[EventWindow]) -> Float[Tensor, "n 1 c h w"]:
-        return encoded(windows, encode)[:, None].to(place)
-
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        if sharing is not None and len(parts := sharing.parts(windows)) > 1:
-            return sharing.predict(state, parts)
         with autocast():
-            prediction, state = ready.unroll(encode_on_device(windows), state)
+            prediction, state = ready.unroll(encoded(windows, encode)[:, None].to(place), state)
         return state, each_map(prediction, lambda field: field[:, 0])
 
-    recoverer, sharing = Recoverer(lambda height, width: None, predict, network=ready), None
-    if isinstance(ready, StokesUNet) and place.type == "cpu":
-        sharing = Sharing(ready, encode_on_device, autocast, ThreadPoolExecutor(1))
-        recoverer = recoverer._replace(at_once=sharing.at_once)
+    def at_once(height: int, width: int) -> int:
+        side = ready.binning if isinstance(ready, StokesUNet) else 1
+        return windows_at_once(height // side, width // side)
+
+    recoverer = Recoverer(lambda height, width: None, predict, network=ready, at_once=at_once)
     trained_us = trained_window_us(metadata)
     return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
 
