@@ -13,17 +13,17 @@ from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.events.windows import encode_windows
 from polarnet.methods import METHODS
-from polarnet.methods.dolp_network import dolp_recoverer, told, weighted_counts
+from polarnet.methods.dolp_network import dolp_recoverer, weighted_counts
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.intensity_networks import intensity_network, load_baseline
+from polarnet.methods.intensity_networks import intensity_methods, load_baseline, sharper
 from polarnet.methods.method import Method, Recoverer, weights_record, why_absent
-from polarnet.methods.sharpening import sharpened
 from polarnet.networks.e2p.network import E2p, interleaved
 from polarnet.networks.e2v.firenet import FireNet
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
 from polarnet.networks.registry import load_network
 from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
 
+COUNTS = {"network": "polarnet", "representation": "event_counts"}
 RECONSTRUCTING = [name for name, method in METHODS.items() if method.reconstructs and method.wraps is None]
 
 
@@ -174,9 +174,9 @@ def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_t
     with torch.no_grad():
         raw, _ = network.unroll(grids)
     intensities = recovered(open_method("firenetplus_published"), sequence.windows).intensities
-    torch.testing.assert_close(intensities, sharpened(raw, setup.sharpening))
-    normalised = intensity_network(network, setup, sharpened=True)
-    assert not torch.allclose(intensities, recovered(normalised, sequence.windows).intensities)
+    torch.testing.assert_close(intensities, sharper(raw, setup.sharpening))
+    (normalised, _) = intensity_methods("m", "m", "#000000", {"firenet": FireNet}, sharpened=True)
+    assert not torch.allclose(intensities, recovered(normalised.open(setup), sequence.windows).intensities)
 
 
 def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
@@ -222,25 +222,25 @@ def stokes_unet(project_root):
 
 
 def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, stokes_unet):
-    events = sequence.windows[0].channels[0]
-    encode = told(stokes_unet, {"network": "polarnet"}, (0.1, 0.4))
+    given = recovered(dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.4)), sequence.windows[:1])
     assert stokes_unet.scale.given == pytest.approx(0.2 / stokes_unet.step)
-    assert torch.equal(encode(events, 1), weighted_counts((0.5, 2.0))(events, 1))
+    inputs = encode_windows(sequence.events, sequence.t_us[:2], weighted_counts((0.5, 2.0)))[:, None]
+    with torch.no_grad():
+        torch.testing.assert_close(given.dolp, stokes_unet.unroll(inputs)[0].dolp[:, 0].clamp(0, 1))
 
 
 def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
     with pytest.raises(ValueError, match="expected network polarnet, got paper; leave thresholds out"):
-        told(torch.nn.Identity(), {"network": "paper"}, (0.1, 0.1))
+        dolp_recoverer(torch.nn.Identity(), COUNTS | {"network": "paper"}, thresholds=(0.1, 0.1))
     with pytest.raises(ValueError, match="expected numbers above 0"):
-        told(stokes_unet, {"network": "polarnet"}, (0.1, 0.0))
+        dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.0))
 
 
 def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, project_root):
     coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
     coarse.load_state_dict(stokes_unet.state_dict())
-    metadata = {"network": "polarnet", "representation": "event_counts"}
-    told_at_use = recovered(dolp_recoverer(stokes_unet, metadata, binning=2), sequence.windows)
-    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, metadata), sequence.windows).dolp)
+    told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows)
+    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows).dolp)
 
 
 @pytest.mark.parametrize(
@@ -250,9 +250,10 @@ def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, p
         ("polarnet", 9, "side of 1 to 8 px, got 9"),
     ],
 )
-def test_binning_that_cannot_be_is_refused(network, side, words):
+def test_binning_that_cannot_be_is_refused(network, side, words, stokes_unet):
+    chosen = stokes_unet if network == "polarnet" else torch.nn.Identity()
     with pytest.raises(ValueError, match=words):
-        dolp_recoverer(torch.nn.Identity(), {"network": network, "representation": "event_counts"}, binning=side)
+        dolp_recoverer(chosen, COUNTS | {"network": network}, binning=side)
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):

@@ -15,7 +15,7 @@ from polarnet.methods.rotating_polarizer import (
     RotatingPolarizerConfig,
     fit_half_turn,
     local_variance,
-    rotating_recoverer,
+    open_rotating,
 )
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import Sine, Trajectory
@@ -74,12 +74,13 @@ def test_a_pixel_with_two_events_counts_as_silent():
     assert log_variance.exp().numpy() == pytest.approx(np.full((2, 3), 1e-4))
 
 
-def test_only_the_last_half_turn_counts_however_the_events_are_cut_into_windows():
+def test_only_the_last_half_turn_counts_however_the_events_are_cut_into_windows(make_setup):
     rotation = steady_rotation(4.0)
     before, after = exact_events(DOLP[::-1], AOLP, rotation, 500_000), exact_events(DOLP, AOLP, rotation, 500_000)
     late = slice_time(after, 375_000, 500_000)
     alone = fit_half_turn(late, rotation, 500_000, IDEAL)
-    recoverer, empty = rotating_recoverer(IDEAL, rotation), Events.empty(2, 3)
+    setup = make_setup("rotating_polarizer", config=IDEAL, rotation=rotation)
+    recoverer, empty = open_rotating(setup), Events.empty(2, 3)
     cuts = [0, 375_000, 400_000, 470_000, 500_000]
     windows = [
         EventWindow([empty, slice_time(late if start >= 375_000 else before, start, stop), empty, empty], start, stop)

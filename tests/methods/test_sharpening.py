@@ -1,25 +1,24 @@
 import torch
 
-from polarnet.methods.sharpening import SharpeningConfig, blur_kernel, sharpened, unsharp_masked
-
-OFF = SharpeningConfig(unsharp_amount=0.0, unsharp_sigma=1.0)
+from polarnet.methods.intensity_networks import blur_kernel, sharper
+from polarnet.methods.method import SharpeningConfig
 
 
 def test_switched_off_it_only_clips():
     images = torch.linspace(-1, 2, 4 * 6 * 7).view(1, 4, 6, 7)
-    assert torch.equal(sharpened(images, OFF), images.clamp(0, 1))
+    assert torch.equal(sharper(images, SharpeningConfig(0.0, 1.0)), images.clamp(0, 1))
 
 
 def test_the_unsharp_mask_leaves_flat_images_alone_and_overshoots_at_an_edge():
     flat = torch.full((1, 1, 8, 9), 0.4)
-    torch.testing.assert_close(unsharp_masked(flat, 0.3, 1.0), flat)
+    torch.testing.assert_close(sharper(flat, SharpeningConfig(0.3, 1.0)), flat)
     edge = torch.zeros(1, 1, 8, 10)
-    edge[..., 5:] = 1.0
-    sharp = unsharp_masked(edge, 0.3, 1.0)[0, 0, 4]
+    edge[..., 5:] = 0.5
+    sharp = sharper(0.25 + edge, SharpeningConfig(0.3, 1.0))[0, 0, 4] - 0.25
     beyond = blur_kernel(1.0)[:, :2].sum()  # what the blur brings over the edge to the first bright pixel
-    torch.testing.assert_close(sharp[5], 1 + 0.3 * beyond.float())
-    torch.testing.assert_close(sharp[4], -0.3 * beyond.float())
-    torch.testing.assert_close(sharp[[0, 9]], torch.tensor([0.0, 1.0]))
+    torch.testing.assert_close(sharp[5], 0.5 + 0.15 * beyond.float())
+    torch.testing.assert_close(sharp[4], -0.15 * beyond.float())
+    torch.testing.assert_close(sharp[[0, 9]], torch.tensor([0.0, 0.5]))
 
 
 def test_the_kernel_is_the_published_one():

@@ -4,7 +4,8 @@ import math
 import pytest
 import torch
 
-from polarnet.methods.stokes_gain import GainConfig, consistent, gains, solved
+from polarnet.methods.intensities import consistent, gains, solved
+from polarnet.methods.method import GainConfig
 from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities, stokes_from_polarization
 
 CONFIG = GainConfig(window_frames=10, rounds=5, pixels=20_000, smallest=0.1, pull=0.0)

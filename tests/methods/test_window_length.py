@@ -5,7 +5,7 @@ from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.method import Recoverer
-from polarnet.methods.window_length import of_any_length
+from polarnet.methods.overlap import of_any_length
 from polarnet.stokes import Prediction
 
 TRAINED_US = 1000

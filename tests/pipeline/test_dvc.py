@@ -164,10 +164,9 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
-        ("methods/window_length.py", ROWS | {"report"}),
+        ("methods/overlap.py", ROWS | {"report"}),
         ("terminal/progress.py", set()),
         ("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
-        thorough("methods/overlap.py", ROWS | {"report"}),
         thorough("networks/polarnet/stokes_unet.py", {"train", "report"} | ROWS),
         thorough("networks/paper/dolp_unet.py", {"report"} | ROWS),
         thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
