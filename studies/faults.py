@@ -33,7 +33,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from polarnet.benchmark.row_results import read_record, read_rows
+from polarnet.benchmark.results import read_record, read_rows
 from polarnet.config.tree import load
 from polarnet.metrics.lpips import Lpips, stored_record
 from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint

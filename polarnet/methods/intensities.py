@@ -36,19 +36,7 @@ def from_intensities(intensities: Float[Tensor, "n c h w"]) -> Prediction:
 
 
 def with_gain(method: Method) -> Method:
-    """The method NAME+gain, which scales the intensities of `method` so that I0 + I90 = I45 + I135.
-
-    If both rows are wanted, they share one run: `convert` turns the predictions of `method` into those of NAME+gain.
-    """
-
-    def convert(setup: Setup, before: State, prediction: Prediction) -> tuple[State, Prediction]:
-        intensities = prediction.intensities
-        if intensities is None:
-            raise ValueError(f"{method.name} reconstructs no intensities, so that it has no gains to solve")
-        earlier = intensities[:0] if before is None else before
-        images = torch.cat([earlier, intensities])
-        solved = from_intensities(consistent(images, setup.gain, len(earlier)))
-        return images[max(0, len(images) + 1 - setup.gain.window_frames) :], solved
+    """The method NAME+gain, which scales the intensities of `method` so that I0 + I90 = I45 + I135."""
 
     def open_both(setup: Setup) -> Recoverer:
         inner = method.open(setup)
@@ -57,22 +45,18 @@ def with_gain(method: Method) -> Method:
             return inner.start(height, width), None
 
         def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-            state, images = state
+            state, earlier = state
             state, prediction = inner.step(state, windows)
-            images, prediction = convert(setup, images, prediction)
-            return (state, images), prediction
+            assert prediction.intensities is not None, f"{method.name} reconstructs no intensities"
+            images = prediction.intensities if earlier is None else torch.cat([earlier, prediction.intensities])
+            known = len(images) - len(windows)
+            kept = images[max(0, len(images) + 1 - setup.gain.window_frames) :]
+            return (state, kept), from_intensities(consistent(images, setup.gain, known))
 
         return Recoverer(start, predict, inner.takes_events_once, inner.network)
 
-    return dataclasses.replace(
-        method,
-        name=method.name + GAIN,
-        label=f"{method.label}, gains solved",
-        open=open_both,
-        config=None,
-        wraps=method,
-        convert=convert,
-    )
+    label = f"{method.label}, gains solved"
+    return dataclasses.replace(method, name=method.name + GAIN, label=label, open=open_both, config=None, wraps=method)
 
 
 def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4 h w"]:

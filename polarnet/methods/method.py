@@ -145,9 +145,7 @@ class Method:
     """Glossary sentence of the HTML pages. For a row with several possible networks or published weights, it states
     the difference from the network's own sentence; empty if that sentence suffices."""
     wraps: "Method | None" = None
-    """Wrapped method, whose predictions `convert` turns into those of this method."""
-    convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
-    """(setup, state (None at the start), prediction of the wrapped method) -> (new state, prediction)."""
+    """Method whose section and weights this one uses."""
 
     @property
     def section(self) -> str:

@@ -25,16 +25,9 @@ from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.truth import frames_of
 
 IDEAL = RotatingPolarizerConfig(
-    threshold_on=0.2,
-    threshold_off=0.2,
-    cutoff_hz=0.0,
-    level_dn=60.0,
-    ridge=1e-9,
-    silent_dolp=0.1,
-    spread_window=3,
-    spread_scale=1.0,
-    variance_floor=1e-4,
-)
+    threshold_on=0.2, threshold_off=0.2, cutoff_hz=0.0, level_dn=60.0, ridge=1e-9, silent_dolp=0.1,
+    spread_window=3, spread_scale=1.0, variance_floor=1e-4,
+)  # fmt: skip
 """For events exactly at the thresholds of the logarithm."""
 DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
 AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])

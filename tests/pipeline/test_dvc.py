@@ -17,9 +17,7 @@ from polarnet.config.origins import pipeline
 
 SIMULATION = ("ingest", "synthesize", "emulate")
 REPORT_OUTS = ("metrics.json", "history", "sets")
-ROWS = {
-    f"benchmark@{row}" for row in YAML(typ="safe").load(Path(__file__).parents[2] / "params.yaml")["rows"]
-}  # all rows
+ROWS = {f"benchmark@{row}" for row in YAML(typ="safe").load(Path(__file__).parents[2] / "params.yaml")["rows"]}
 TRAININGS = {"train", "train_baseline@e2v"}
 
 
@@ -95,12 +93,6 @@ def project(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     shutil.copytree(finished, tmp_path / "project")
     enter(tmp_path / "project", monkeypatch)
     return tmp_path / "project"
-
-
-@pytest.fixture(scope="module")
-def edited(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the finished project for tests that change one file each and run what that makes stale."""
-    return Path(shutil.copytree(finished, tmp_path_factory.mktemp("edited") / "project"))
 
 
 @contextlib.contextmanager
@@ -180,9 +172,8 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("cli/doctor.py", set()),
     ],
 )
-def test_a_changed_file_runs_what_it_can_change(edited, monkeypatch, file, stages):
-    enter(edited, monkeypatch)
-    append(edited / "polarnet" / file)
+def test_a_changed_file_runs_what_it_can_change(project, file, stages):
+    append(project / "polarnet" / file)
     assert repro() == stages
 
 
