@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 import torch
 
-from polarnet.benchmark.row_results import read_record, read_rows
+from polarnet.benchmark.results import read_record, read_rows
 from polarnet.cli.outputs import run_folder
 from polarnet.config.origins import Run
 from polarnet.config.tree import load

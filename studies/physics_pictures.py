@@ -19,7 +19,7 @@ from torch import Tensor
 from polarnet.config.tree import load
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
-from polarnet.methods.stokes_gain import consistent
+from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.reports.overview import OFF, ON

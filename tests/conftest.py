@@ -29,7 +29,7 @@ SLOWEST_FIRST = (
     "cli/test_sensors.py",
     "config/test_sweep.py",
     "storage/test_parts.py",
-    "benchmark/test_row_results.py",
+    "benchmark/test_results.py",
     "cli/test_wheel.py",
     "reports/test_browser.py",
     "reports/test_curves.py",

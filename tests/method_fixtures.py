@@ -9,10 +9,8 @@ from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS
 from polarnet.methods.complementary_filter import FilterConfig
-from polarnet.methods.method import Setup
+from polarnet.methods.method import GainConfig, Setup, SharpeningConfig
 from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig
-from polarnet.methods.sharpening import SharpeningConfig
-from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2p.network import E2p

@@ -34,21 +34,21 @@ FLOPS = flop_registry | {
 def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
     """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
     network = opened(METHODS[row], context).network if row in METHODS else None
-
     few, many = first_windows(sequence, COUNTED_WINDOWS), first_windows(sequence, TIMED_WINDOWS)
 
     def counted() -> Any:
         return predictions_of([row], few, context)
 
-    def timed() -> Any:
-        return predictions_of([row], many, context)
-
     counted()  # compiles and allocates
-    with _Flops() as flops:
-        peak = _peak_bytes(counted, context.device)
+    flops, peak = observed(counted, context.device)
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        predictions_of([row], many, context)
+        seconds.append(time.perf_counter() - start)
     return Cost(
-        ms_per_window=1000 * statistics.median(_seconds(timed) for _ in range(REPEATS)) / len(many.dolp),
-        gflop=flops.total / len(few.dolp) / 1e9 if network is not None else None,
+        ms_per_window=1000 * statistics.median(seconds) / len(many.dolp),
+        gflop=flops / len(few.dolp) / 1e9 if network is not None else None,
         params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
         peak_mib=peak / MIB,
     )
@@ -61,74 +61,54 @@ def first_windows(sequence: TestSequence, count: int) -> TestSequence:
     return replace(sequence, t_us=sequence.t_us[: count + 1], valid=valid, **frames)
 
 
-def _seconds(run: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    run()
-    return time.perf_counter() - start
-
-
-def _peak_bytes(run: Callable[[], Any], device: torch.device) -> float:
-    if device.type == "cuda":
+def observed(run: Callable[[], Any], device: torch.device) -> tuple[int, float]:
+    """FLOPs of a run, and the most bytes that its tensors and arrays hold at once."""
+    cuda = device.type == "cuda"
+    before = 0
+    if cuda:
         torch.cuda.synchronize(device)
         before = torch.cuda.memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
-        run()
-        return float(torch.cuda.max_memory_allocated(device) - before)
     tracemalloc.start()  # numpy reports its arrays to tracemalloc
     try:
-        with _TensorMemory() as tensors:
+        with _Observed() as operations:
             run()
         arrays = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    return float(arrays + tensors.highest)
+    peak = torch.cuda.max_memory_allocated(device) - before if cuda else arrays + operations.highest
+    return operations.flops, float(peak)
 
 
-class _Observer(TorchDispatchMode):
-    """A mode that sees every operation. By default torch imports its compiler (1.5 s) to exclude the mode from it."""
-
-    @classmethod
-    def _should_skip_dynamo(cls) -> bool:
-        return False
-
-
-class _Flops(_Observer):
-    """Adds up the FLOPs of operations."""
-
-    total = 0
-
-    def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation and count it, if it has a formula."""
-        out = operation(*args, **(kwargs or {}))
-        if (formula := FLOPS.get(operation.overloadpacket)) is not None:
-            self.total += formula(*args, **(kwargs or {}), out_val=out)
-        return out
-
-
-class _TensorMemory(_Observer):
-    """Tracks the bytes of live tensors that operations return; scratch memory inside kernels is not counted."""
+class _Observed(TorchDispatchMode):
+    """Adds up FLOPs of operations, and tracks the bytes of live tensors that they return, without kernels' scratch."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.held = 0
-        self.highest = 0
+        self.flops = self.held = self.highest = 0
         self._known = weakref.WeakSet[torch.UntypedStorage]()
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # else torch imports its compiler (1.5 s) to exclude the mode from it
+
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation and count the storage of its result, unless that is a view of a known storage."""
-        for tensor in tree_leaves((args, kwargs)):
-            if isinstance(tensor, torch.Tensor):
-                self._known.add(tensor.untyped_storage())  # weights and events existed before
+        """Run the operation; count its FLOPs, if it has a formula, and the storage of its result, unless known."""
+        self._known.update(_storages((args, kwargs)))  # weights and events existed before
         out = operation(*args, **(kwargs or {}))
-        for tensor in tree_leaves(out):
-            if isinstance(tensor, torch.Tensor):
-                storage = tensor.untyped_storage()
-                if storage not in self._known:
-                    self._known.add(storage)
-                    self.held += storage.nbytes()
-                    weakref.finalize(storage, self._freed, storage.nbytes())
+        if (formula := FLOPS.get(operation.overloadpacket)) is not None:
+            self.flops += formula(*args, **(kwargs or {}), out_val=out)
+        for storage in _storages(out):
+            if storage not in self._known:
+                self._known.add(storage)
+                self.held += storage.nbytes()
+                weakref.finalize(storage, self._freed, storage.nbytes())
         self.highest = max(self.highest, self.held)
         return out
 
     def _freed(self, count: int) -> None:
         self.held -= count
+
+
+def _storages(values: Any) -> list[torch.UntypedStorage]:
+    return [tensor.untyped_storage() for tensor in tree_leaves(values) if isinstance(tensor, torch.Tensor)]

@@ -1,16 +1,106 @@
-"""Result files of the whole table: scores, costs, details, scores of every frame, and panels of one test set."""
+"""Result files: a folder of each row on every test set, and the whole table of a set put together from them.
+
+ROW/row.json                 why the row was left out, or null; the weights that it used
+ROW/SET/results.json         scores of each frame, cost, sums of the expected errors
+ROW/SET/panels/SEQUENCE.npz  one window: its events, the truth and the row's prediction
+"""
 
 import dataclasses
 import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import torch
 
 from polarnet.benchmark.paired import paired_comparisons
 from polarnet.benchmark.run import Benchmark
-from polarnet.benchmark.score import METRICS, BenchmarkConfig, scene_means, summary, write_frames
-from polarnet.storage.panels import write_panel
+from polarnet.benchmark.score import METRICS, BenchmarkConfig, Cost, FrameScore, scene_means, summary, write_frames
+from polarnet.metrics.reliability import Reliability
+from polarnet.runtime.files import check_seal, seal
+from polarnet.storage.panels import read_panel, write_panel
+
+MADE_BY = "run `dvc repro`, or `python -m stages.row` for all rows"
+
+
+class RowRecord(NamedTuple):
+    """Content of row.json."""
+
+    left_out: str | None
+    """Reason why the row could not run; None if it ran."""
+    weights: Mapping[str, Mapping[str, str]]
+    """File name, sha256 and network by section of `methods`; empty for a row without weights."""
+
+
+def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benchmark]) -> None:
+    """Write `folder` anew with the results of `row` on each set; row.json comes last and marks the folder complete."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name, benchmark in sets.items():
+        (folder / name / "panels").mkdir(parents=True)
+        sums = benchmark.reliability.get(row)
+        results = {
+            "frames": [score[1:] for score in benchmark.rows if score.method == row],
+            "cost": dataclasses.asdict(benchmark.costs[row]),
+            "reliability": None if sums is None else [sum_.tolist() for sum_ in dataclasses.astuple(sums)],
+        }
+        (folder / name / "results.json").write_text(json.dumps(results) + "\n")
+        for panel in benchmark.panels:
+            write_panel(folder / name / "panels", panel, [row])
+    (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
+    seal(folder)
+
+
+def read_record(folder: Path) -> RowRecord:
+    """Content of row.json; FileNotFoundError if the row was not run, ValueError if a file of the folder has changed."""
+    if not (folder / "row.json").exists():
+        raise FileNotFoundError(f"{folder / 'row.json'} is missing: row {folder.name} was not run; {MADE_BY}")
+    check_seal(folder)
+    return RowRecord(**json.loads((folder / "row.json").read_text()))
+
+
+def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
+    """Results of several rows on one set, each from its folder, as if they had run together.
+
+    FileNotFoundError if a row has not run on this set. ValueError if rows have other sequences or panels than the
+    first row.
+    """
+    rows = {row: _read_row(row, folder / test_set) for row, folder in folders.items()}
+    first = next(iter(rows))
+    sequences, shown = _sequences(rows[first])
+    for row, results in rows.items():
+        if _sequences(results) != (sequences, shown):
+            raise ValueError(
+                f"row {row} was scored on other sequences of set {test_set} than row {first}: run both again, {MADE_BY}"
+            )
+    ordered = [score for name in sequences for one in rows.values() for score in one.rows if score.sequence == name]
+    by_sequence = [{panel.sequence: panel for panel in one.panels} for one in rows.values()]
+    panels = []
+    for name in sequences:
+        if name in shown:
+            predictions = {row: one for panels_of in by_sequence for row, one in panels_of[name].predictions.items()}
+            panels.append(dataclasses.replace(by_sequence[0][name], predictions=predictions))
+    costs = {row: one.costs[row] for row, one in rows.items()}
+    sums = {row: one.reliability[row] for row, one in rows.items() if row in one.reliability}
+    return Benchmark(ordered, costs, panels, sums)
+
+
+def _read_row(row: str, folder: Path) -> Benchmark:
+    """Results of one row on one set."""
+    file = folder / "results.json"
+    if not file.exists():
+        raise FileNotFoundError(f"{file} is missing: row {row} has not run on set {folder.name}; {MADE_BY}")
+    results = json.loads(file.read_text())
+    sums = [torch.tensor(column, dtype=torch.float64) for column in results["reliability"] or ()]
+    panels = [read_panel(path) for path in sorted((folder / "panels").glob("*.npz"))]
+    scores = [FrameScore(row, *score) for score in results["frames"]]
+    return Benchmark(scores, {row: Cost(**results["cost"])}, panels, {row: Reliability(*sums)} if sums else {})
+
+
+def _sequences(results: Benchmark) -> tuple[list[str], set[str]]:
+    """Sequences of a row in order, and those with a panel."""
+    return list(dict.fromkeys(score.sequence for score in results.rows)), {panel.sequence for panel in results.panels}
 
 
 def write_benchmark(

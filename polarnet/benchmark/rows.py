@@ -11,17 +11,7 @@ from torch import Tensor
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS, ROWS
-from polarnet.methods.method import (
-    Method,
-    Recoverer,
-    Setup,
-    State,
-    clamped,
-    each_map,
-    weights_file,
-    weights_record,
-    why_absent,
-)
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_file, weights_record, why_absent
 from polarnet.metrics.references import REFERENCES, Reference
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
@@ -48,25 +38,22 @@ class Context:
 
 @torch.no_grad()
 def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
-    """Prediction by row, one frame per window, on the CPU; NAME and NAME+gain share one run over the events."""
-    predictions: dict[str, Prediction] = {}
-    for name in sorted(names, key=lambda name: name in METHODS and METHODS[name].wraps is not None):
-        if name in REFERENCES:
-            predictions[name] = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
-            continue
-        method = METHODS[name]
-        if method.wraps is not None and method.convert is not None and method.wraps.name in predictions:
-            _, prediction = method.convert(context.setup_of(method), None, predictions[method.wraps.name])
-            predictions[name] = clamped(prediction)
-        else:
-            predictions[name] = run(opened(method, context), sequence.windows_for(method.rotating))
-    return {name: each_map(predictions[name]._replace(stokes=None, intensities=None), Tensor.cpu) for name in names}
+    """Prediction by row, one frame per window, on the CPU."""
+    return {name: each_map(_predicted(name, sequence, context), Tensor.cpu) for name in names}
+
+
+def _predicted(name: str, sequence: TestSequence, context: Context) -> Prediction:
+    if name in REFERENCES:
+        return REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
+    method = METHODS[name]
+    prediction = run(opened(method, context), sequence.windows_for(method.rotating))
+    return prediction._replace(stokes=None, intensities=None)
 
 
 def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
     """Run a method over consecutive windows from its initial state, one window at a time as from a camera."""
     first = windows[0].channels[0]
-    state: State = recoverer.start(first.height, first.width)
+    state = recoverer.start(first.height, first.width)
     frames: list[Prediction] = []
     for window in windows:
         state, prediction = recoverer.step(state, [window])
@@ -103,18 +90,16 @@ def why_left_out(name: str, context: Context) -> str | None:
 
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
-    """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights.
-
-    ValueError or FileNotFoundError if weights are missing or belong to another network.
-    """
-    return {method.section: weights_record(method, context.setup_of(method)) for method in _with_weights(names)}
+    """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights."""
+    return {method.section: weights_record(method, setup) for method, setup in _with_weights(names, context)}
 
 
 def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
     """Checkpoint metadata by section of `methods`, for the rows with a checkpoint of polarnet."""
-    paths = {method.section: weights_file(context.setup_of(method)) for method in _with_weights(names)}
+    paths = {method.section: weights_file(setup) for method, setup in _with_weights(names, context)}
     return {row: load_checkpoint(path)[1] for row, path in paths.items() if path.suffix == ".safetensors"}
 
 
-def _with_weights(names: Sequence[str]) -> list[Method]:
-    return [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]
+def _with_weights(names: Sequence[str], context: Context) -> list[tuple[Method, Setup]]:
+    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]
+    return [(method, context.setup_of(method)) for method in methods]

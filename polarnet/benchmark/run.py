@@ -97,12 +97,12 @@ def at_stored_precision(row: str, sequence: str, prediction: Prediction) -> Pred
                 f"numbers; the method, its weights or the events are damaged"
             )
     dolp = dequantise_fraction(quantise_fraction(prediction.dolp))
-    aolp = log_variance = None
-    if prediction.aolp is not None:
-        aolp = dequantise_angle(quantise_angle(prediction.aolp.remainder(torch.pi)))
-    if prediction.log_variance is not None:
-        log_variance = prediction.log_variance.clamp(LOWEST, HIGHEST).half().float()
-    return Prediction(dolp, aolp, log_variance)
+    aolp, log_variance = prediction.aolp, prediction.log_variance
+    return Prediction(
+        dolp,
+        None if aolp is None else dequantise_angle(quantise_angle(aolp.remainder(torch.pi))),
+        None if log_variance is None else log_variance.clamp(LOWEST, HIGHEST).half().float(),
+    )
 
 
 def _spread(scenes: Mapping[str, str], count: int) -> set[str]:

@@ -142,28 +142,24 @@ def score_sequence(
                     f"got {tuple(frames.shape)}"
                 )
 
-    def scored(frames: Tensor) -> Tensor:
-        return frames[warmup_windows:].to(device)
+    def scored(frames: Tensor | None) -> Any:
+        return None if frames is None else frames[warmup_windows:].to(device)
 
-    counted = {
-        method: (scored(prediction.dolp), None if prediction.aolp is None else scored(prediction.aolp))
-        for method, prediction in predictions.items()
-    }
-    truth, true_aolp = (x[warmup_windows:].to(device) for x in (sequence.dolp, sequence.aolp))
-    valid = None if sequence.valid is None else scored(sequence.valid)
+    counted = {method: (scored(one.dolp), scored(one.aolp)) for method, one in predictions.items()}
+    truth, true_aolp, valid = scored(sequence.dolp), scored(sequence.aolp), scored(sequence.valid)
     if valid is not None and not (known := valid.any(-1).any(-1)).all():
         window = warmup_windows + int(known.logical_not().nonzero()[0])
         raise ValueError(f"{sequence.name}, window {window}: no pixel is valid; leave this measurement out")
     oracle_mse = spread_mse(truth, valid)
     compared = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
-    distances = _lpips_of(compared, truth, lpips)
+    distances = {} if lpips is None else _lpips_of(compared, truth, lpips)
     rows = []
     for method, (dolp, aolp) in counted.items():
         per_frame: dict[str, Tensor | None] = {
             "mse": mse(dolp, truth, valid),
             "psnr": psnr(dolp, truth, valid),
             "ssim": ssim(dolp, truth, valid),
-            "lpips": None if distances is None else distances[method],
+            "lpips": distances.get(method),
             "corr": correlation(dolp, truth, valid),
             "grad": gradient_agreement(dolp, truth, valid),
             "level_mse": level_mse(dolp, truth, valid),
@@ -171,11 +167,9 @@ def score_sequence(
             "aolp_deg": None if aolp is None else aolp_error_deg(aolp, true_aolp, truth, valid),
             "oracle_mse": oracle_mse,
         }
-        columns = {
-            name: [None] * len(windows) if values is None else values.tolist() for name, values in per_frame.items()
-        }
+        columns = {name: values.tolist() for name, values in per_frame.items() if values is not None}
         for i, window in enumerate(windows):
-            scores: dict[str, Any] = {name: values[i] for name, values in columns.items()}
+            scores: dict[str, Any] = dict.fromkeys(per_frame) | {name: values[i] for name, values in columns.items()}
             t_us = int(sequence.t_us[window + 1])
             rows.append(_finite(FrameScore(method, sequence.scene, sequence.name, window, t_us, **scores)))
     return rows
@@ -266,10 +260,8 @@ def _skill(error: Any, oracle: Any) -> Any:
 
 
 def _lpips_of(
-    recovered: Mapping[str, Float[Tensor, "n h w"]], truth: Float[Tensor, "n h w"], lpips: Lpips | None
-) -> dict[str, Float[Tensor, " n"]] | None:
-    if lpips is None:
-        return None
+    recovered: Mapping[str, Float[Tensor, "n h w"]], truth: Float[Tensor, "n h w"], lpips: Lpips
+) -> dict[str, Float[Tensor, " n"]]:
     parts: dict[str, list[Tensor]] = {method: [] for method in recovered}
     for start in range(0, len(truth), FRAMES_AT_ONCE):
         chunk = slice(start, start + FRAMES_AT_ONCE)

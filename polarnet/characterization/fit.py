@@ -5,29 +5,38 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64
 
-from polarnet.characterization.bandwidth import bandwidth
-from polarnet.characterization.estimates import GROUPS, MAX_RELATIVE_ERROR, Estimate
-from polarnet.characterization.increments import by_pixel, chosen_pixels, intervals_of
-from polarnet.characterization.known_light import KnownLight, Source, increments_of, source_of
-from polarnet.characterization.leak import PolarityThresholds, leak_drift, thresholds_without_leak
-from polarnet.characterization.noise import (
-    NOISE_HOT_FACTOR,
-    PRIOR_SPREAD_DECADES,
-    Noise,
-    estimate_noise,
-    hot_under_constant_light,
-    nominal_shot_noise_hz,
+from polarnet.characterization.intervals import (
+    GROUPS,
+    Estimate,
+    between_shot_noise_us,
+    by_pixel,
+    chosen_pixels,
+    intervals_of,
+    piled_up_us,
 )
-from polarnet.characterization.refractory import between_shot_noise_us, piled_up_us
-from polarnet.characterization.thresholds import PixelThresholds, correlation, deviation
+from polarnet.characterization.light import KnownLight, Source, increments_of, source_of
+from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
+from polarnet.characterization.thresholds import (
+    PixelThresholds,
+    bandwidth,
+    correlation,
+    deviation,
+    thresholds_without_leak,
+)
 from polarnet.events.stream import Events
 
 MAX_LEAK_ERROR = 0.05  # relative; above it shot noise hides the leak, and its error is unreliable
 MIN_PIXELS = 50
 MAX_SPREAD_ERROR = 0.3  # relative, of the leak's spread and jitter
 MAX_SWING = 0.3  # relative swing of the OFF rate under constant light; larger: something moved or flickered
+KNOWN_LIGHT_PARAMETERS = (
+    "contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma_on", "contrast_threshold_sigma_off",
+    "contrast_threshold_correlation", "cutoff_hz",
+)  # fmt: skip
+CONSTANT_LIGHT_PARAMETERS = (
+    "shot_noise_rate_hz", "noise_rate_cov_decades", "leak_jitter", "hot_pixel_share", "hot_pixel_rate_hz",
+)  # fmt: skip
 
 
 @dataclass
@@ -46,23 +55,6 @@ class SensorFit:
             self.estimates[name] = estimate
 
 
-KNOWN_LIGHT_PARAMETERS = (
-    "contrast_threshold_on",
-    "contrast_threshold_off",
-    "contrast_threshold_sigma_on",
-    "contrast_threshold_sigma_off",
-    "contrast_threshold_correlation",
-    "cutoff_hz",
-)
-CONSTANT_LIGHT_PARAMETERS = (
-    "shot_noise_rate_hz",
-    "noise_rate_cov_decades",
-    "leak_jitter",
-    "hot_pixel_share",
-    "hot_pixel_rate_hz",
-)
-
-
 def fit_sensor(
     static: Events | None, static_light: float, known: Sequence[KnownLight], others: Sequence[Events] = ()
 ) -> SensorFit:
@@ -72,10 +64,8 @@ def fit_sensor(
     that is not known. ValueError if nothing was recorded, or if the recordings are of sensors of different sizes.
     """
     recordings = [*([] if static is None else [static]), *(one.events for one in known), *others]
-    if not recordings:
-        raise ValueError("expected at least one recording; give a static, a moving or a flicker recording")
     sizes = {(one.height, one.width) for one in recordings}
-    if len(sizes) > 1:
+    if len(sizes) != 1:
         raise ValueError(f"expected recordings of one sensor, got sizes {sorted(sizes)} (height, width)")
     fit = SensorFit()
     ordered = [by_pixel(one) for one in recordings]
@@ -92,20 +82,15 @@ def fit_sensor(
     dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
     reason = "intervals between a pixel's events do not pile up at a minimum, and shot noise is too rare to show it"
     fit.enter("refractory_period_us", dead_time, reason)
+    leak = noise.leak if noise and noise.leak.error <= MAX_LEAK_ERROR * noise.leak.value else None
+    reason = "under constant light, shot noise comes before the leak; record brighter"
+    fit.enter("leak_rate_hz", leak, "needs a static recording" if noise is None else reason)
     shortest_us, first = dead_time.value if dead_time else 0.0, 0 if static is None else 1
     sources = [source_of(one, events, shortest_us) for one, events in zip(known, ordered[first:], strict=False)]
-    leak = None if noise is None else _leak_under_constant_light(noise)
-    deviations = (0.0, 0.0)
-    if sources:
-        pair, leak = _fit_known(sources, leak, PRIOR_SPREAD_DECADES if noise is None else noise.leak_spread.value, fit)
-        on, off = (fit.estimates[f"contrast_threshold_{p}"].value for p in ("on", "off"))
-        deviations = deviation(pair.on) / on, deviation(pair.off) / off
-    else:
-        fit.missing |= dict.fromkeys(
-            KNOWN_LIGHT_PARAMETERS, "needs a moving recording with frames, or a flicker recording"
-        )
-    reason = "under constant light, shot noise comes before the leak; record brighter, or a moving scene with frames"
-    fit.enter("leak_rate_hz", leak, "needs a static recording" if noise is None else reason)
+    deviations = _fit_known(fit, sources, leak.value if leak else 0.0) if sources else (0.0, 0.0)
+    if not sources:
+        reason = "needs a moving recording with frames, or a flicker recording"
+        fit.missing |= dict.fromkeys(KNOWN_LIGHT_PARAMETERS, reason)
     if noise is None:
         fit.missing |= dict.fromkeys(CONSTANT_LIGHT_PARAMETERS, "needs a static recording")
     else:
@@ -113,20 +98,14 @@ def fit_sensor(
     return fit
 
 
-def _fit_known(
-    sources: Sequence[Source], leak: Estimate | None, spread_decades: float, fit: SensorFit
-) -> tuple[PolarityThresholds, Estimate | None]:
-    """Thresholds, and the leak (from its drift if `leak` is None); enters bandwidth and thresholds."""
+def _fit_known(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
+    """Enter bandwidth and thresholds; returns the relative deviations of the ON and OFF thresholds."""
     pixels = sources[0].events.pixels
     names = " and ".join(source.name for source in sources)
-    cutoff = bandwidth(sources, leak.value if leak else 0.0)
+    cutoff = bandwidth(sources, leak_hz)
     fit.enter("cutoff_hz", cutoff, "the light changes too slowly; add a flicker near the bandwidth")
-    cutoff_hz = cutoff.value if cutoff else 0.0
-    moving = [source for source in sources if source.moves]
-    if leak is None and moving:
-        drift = leak_drift(increments_of(moving, cutoff_hz), pixels, spread_decades)
-        leak = drift if drift and drift.error < MAX_RELATIVE_ERROR * drift.value else None
-    pair = thresholds_without_leak(increments_of(sources, cutoff_hz), leak.value if leak else 0.0, pixels)
+    pair = thresholds_without_leak(increments_of(sources, cutoff.value if cutoff else 0.0), leak_hz, pixels)
+    deviations = []
     for polarity, thresholds in zip(("on", "off"), pair, strict=True):
         values = thresholds.threshold[np.isfinite(thresholds.threshold)]
         if len(values) < MIN_PIXELS:
@@ -134,24 +113,23 @@ def _fit_known(
                 f"{names}: expected {polarity.upper()} thresholds of at least {MIN_PIXELS} pixels, got {len(values)}; "
                 f"record for longer, with more contrast, and check that frames and events share clock and pixels"
             )
-        source = f"{names}, {len(values):,} pixels, increments within {thresholds.scale:.1%}"
-        spread = float(values.std())
-        mean = Estimate(float(np.median(values)), 1.2533 * spread / math.sqrt(len(values)), source)
-        error = _grouped_error(lambda some: deviation(some[0]), [thresholds])
-        fit.estimates[f"contrast_threshold_{polarity}"] = mean
-        fit.estimates[f"contrast_threshold_sigma_{polarity}"] = Estimate(
-            deviation(thresholds), error, "two halves of these"
-        )
         if len(values) < 0.9 * pixels:
             fit.notes.append(
                 f"{1 - len(values) / pixels:.0%} of the pixels have too few {polarity.upper()} events for a threshold; "
                 f"if those are the pixels of high threshold, mean and deviation are too small: record for longer"
             )
+        source = f"{names}, {len(values):,} pixels, increments within {thresholds.scale:.1%}"
+        mean, sigma = float(np.median(values)), deviation(thresholds)
+        error = 1.2533 * float(values.std()) / math.sqrt(len(values))
+        fit.estimates[f"contrast_threshold_{polarity}"] = Estimate(mean, error, source)
+        error = _grouped_error(lambda some: deviation(some[0]), [thresholds])
+        fit.estimates[f"contrast_threshold_sigma_{polarity}"] = Estimate(sigma, error, "two halves of these")
+        deviations.append(sigma / mean)
     error = _grouped_error(lambda some: correlation(*some), list(pair))
     common = Estimate(correlation(*pair), error, "ON and OFF of each pixel")
     reason = "the thresholds do not differ between pixels"
     fit.enter("contrast_threshold_correlation", common if math.isfinite(common.value) else None, reason)
-    return pair, leak
+    return deviations[0], deviations[1]
 
 
 def _grouped_error(function: Callable[[list[PixelThresholds]], float], thresholds: list[PixelThresholds]) -> float:
@@ -164,11 +142,6 @@ def _grouped_error(function: Callable[[list[PixelThresholds]], float], threshold
     return float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
-def _leak_under_constant_light(noise: Noise) -> Estimate | None:
-    """The leak, unless shot noise hides it."""
-    return noise.leak if noise.leak.error <= MAX_LEAK_ERROR * noise.leak.value else None
-
-
 def _enter_noise(fit: SensorFit, noise: Noise, light: float, deviations: tuple[float, float]) -> None:
     """Enter shot noise, its spread, jitter and hot pixels; `deviations` are the relative ones of the thresholds."""
     rate = noise.shot_on_hz + noise.shot_off_hz
@@ -176,17 +149,14 @@ def _enter_noise(fit: SensorFit, noise: Noise, light: float, deviations: tuple[f
     source = f"{noise.duration_s:.0f} s under constant light of {light:g} DN"
     fit.estimates["shot_noise_rate_hz"] = Estimate(value, value * noise.shot_error_hz / rate, source)
     for name, spread in (("noise_rate_cov_decades", noise.leak_spread), ("leak_jitter", noise.leak_jitter)):
-        known = spread.error < MAX_SPREAD_ERROR * spread.value
-        fit.enter(name, spread if known else None, "too few leak events")
-    error = math.sqrt(max(noise.hot.sum(), 1)) / len(noise.hot)
-    source = f"more than {NOISE_HOT_FACTOR:g} times the events of their neighbours under constant light"
-    fit.estimates["hot_pixel_share"] = Estimate(float(noise.hot.mean()), error, source)
-    fit.enter("hot_pixel_rate_hz", _mean_rate(noise.hot_rates_hz), "there are no hot pixels")
-
-
-def _mean_rate(rates_hz: Float64[np.ndarray, " hot"]) -> Estimate | None:
-    """Mean rate of hot pixels, with the error of a mean; None without any."""
-    if not len(rates_hz):
-        return None
-    spread = float(rates_hz.std(ddof=1)) if len(rates_hz) > 1 else float(rates_hz[0])
-    return Estimate(float(rates_hz.mean()), spread / math.sqrt(len(rates_hz)), f"{len(rates_hz):,} hot pixels")
+        precise = spread.error < MAX_SPREAD_ERROR * spread.value
+        fit.enter(name, spread if precise else None, "too few leak events")
+    count, rates_hz = len(noise.hot_rates_hz), noise.hot_rates_hz
+    source = "more than 10 times the events of their neighbours under constant light"
+    share = Estimate(float(noise.hot.mean()), math.sqrt(max(count, 1)) / len(noise.hot), source)
+    fit.estimates["hot_pixel_share"] = share
+    mean = None
+    if count:
+        spread_hz = float(rates_hz.std(ddof=1)) if count > 1 else float(rates_hz[0])
+        mean = Estimate(float(rates_hz.mean()), spread_hz / math.sqrt(count), f"{count:,} hot pixels")
+    fit.enter("hot_pixel_rate_hz", mean, "there are no hot pixels")

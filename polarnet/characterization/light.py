@@ -1,15 +1,21 @@
-"""Known light on a camera: frames with their times, or a sinusoidal flicker, and the pixel's response to it.
+"""Known light on a camera (frames with their times, or a sinusoidal flicker), and its change between events of a pixel.
 
 Light is in digital numbers (DN): 0 is dark, 255 white.
 """
 
+import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from scipy.optimize import minimize_scalar
 
+from polarnet.characterization.intervals import Intervals, PixelEvents, chosen_pixels, intervals_of, undisturbed
+from polarnet.events.stream import Events
 from polarnet.pictures.clips import TIMES_FILE, check_times, times_from_file
 from polarnet.pictures.images import picture_extensions, read_channels
 from polarnet.simulation.compilation import compiled
@@ -20,6 +26,10 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
 STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
 PIECES = 4  # linear pieces of the response between two frames
 SETTLED = 12.0  # time constants of the photoreceptor after which a cycle repeats itself
+SETTLING_US = 100_000  # after the first frame, left out, because the photoreceptor's state is unknown
+PHASES = 32
+PHASE_INTERVALS = 6000  # intervals that the phase of a flicker is fitted to
+BLOCK = 8  # consecutive intervals; even blocks make one half of the data, odd blocks the other
 
 
 @dataclass(frozen=True)
@@ -131,6 +141,122 @@ def flicker_responses(
     """Filtered response at the times of events, from `flicker_cycle`, for a flicker of `phase` at time 0."""
     turns = (t_us * (1e-6 * frequency_hz) + phase / (2 * math.pi)) % 1.0
     return np.interp(turns, np.linspace(0, 1, len(cycle)), cycle)
+
+
+@dataclass(frozen=True)
+class KnownLight:
+    """A recording under known light."""
+
+    name: str
+    events: Events
+    light: MovingLight | Flicker
+
+
+class Source(NamedTuple):
+    """Intervals of a recording under known light, and the filtered response at its events for a bandwidth."""
+
+    name: str
+    events: PixelEvents
+    intervals: Intervals
+    responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
+    moves: bool
+    """Whether the light is a moving scene with frames, not a flicker."""
+
+
+class Increments(NamedTuple):
+    """Changes of the filtered log light between two events of a pixel, times the polarity of the second event."""
+
+    increment: Float64[np.ndarray, " n"]
+    duration_s: Float64[np.ndarray, " n"]
+    pixel: Int64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+    block: Int64[np.ndarray, " n"]
+
+
+def source_of(known: KnownLight, events: PixelEvents, refractory_us: float) -> Source:
+    """The intervals of a recording under known light that neither start-up nor refractory period disturbs."""
+    intervals = undisturbed(intervals_of(events), refractory_us)
+    light = known.light
+    if isinstance(light, MovingLight):
+        after = events.t_us[intervals.start] >= light.t_us[0] + SETTLING_US
+        intervals = Intervals(*(column[after] for column in intervals))
+
+        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+            return moving_responses(light, some.pixel, some.t_us, cutoff_hz)
+    else:
+        flicker = exact_frequency(light, events)
+
+        @functools.cache
+        def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
+            cycle = flicker_cycle(flicker, cutoff_hz)
+            return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+
+        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+            cycle, phase = cycle_and_phase(cutoff_hz)
+            return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
+
+    return Source(known.name, events, intervals, responses, isinstance(light, MovingLight))
+
+
+def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
+    """Increments of all sources, for a photoreceptor of bandwidth `cutoff_hz` at full brightness (0: infinite)."""
+    parts = []
+    for source in sources:
+        response, intervals = source.responses(source.events, cutoff_hz), source.intervals
+        increment = np.where(intervals.on, 1.0, -1.0) * (response[intervals.stop] - response[intervals.start])
+        covered, block = np.isfinite(increment), np.arange(len(increment)) // BLOCK
+        columns = increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block
+        parts.append([column[covered] for column in columns])
+    return Increments(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def at_pixels(source: Source, mask: Bool[np.ndarray, " pixels"]) -> Source:
+    """The part of a source at some pixels."""
+    selected = mask[source.events.pixel]
+    number = np.cumsum(selected) - 1
+    chosen = mask[source.intervals.pixel]
+    start, stop = number[source.intervals.start[chosen]], number[source.intervals.stop[chosen]]
+    rest = (column[chosen] for column in source.intervals[2:])
+    return source._replace(events=chosen_pixels(source.events, mask), intervals=Intervals(start, stop, *rest))
+
+
+def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
+    """The flicker with its frequency on the recording's clock, from the drift of the phase of its events."""
+    t_s, sign = events.t_us * 1e-6, np.where(events.on, 1.0, -1.0)
+    middle = 0.5 * (t_s.min() + t_s.max())
+    frequency = flicker.frequency_hz
+    for parts in (8, 2):
+        edges = np.linspace(t_s.min(), t_s.max(), parts + 1)
+        phase = 2 * math.pi * frequency * (t_s - middle)
+        real, imaginary = (np.histogram(t_s, edges, weights=sign * wave(phase))[0] for wave in (np.cos, np.sin))
+        phasors = real - 1j * imaginary
+        turn = np.angle((phasors[1:] * phasors[:-1].conj()).sum())
+        frequency += turn / (2 * math.pi * (edges[1] - edges[0]))
+    return replace(flicker, frequency_hz=float(frequency))
+
+
+def flicker_phase(
+    cycle: Float64[np.ndarray, " k"], frequency_hz: float, events: PixelEvents, intervals: Intervals
+) -> float:
+    """Phase of the flicker at time 0, radians, which makes the increments of each polarity most nearly equal."""
+    step = max(1, len(intervals.start) // PHASE_INTERVALS)
+    start_us, stop_us = events.t_us[intervals.start[::step]], events.t_us[intervals.stop[::step]]
+    on = intervals.on[::step]
+
+    def unequal(phase: float) -> float:
+        rise = flicker_responses(cycle, frequency_hz, phase, stop_us)
+        rise -= flicker_responses(cycle, frequency_hz, phase, start_us)
+        total = 0.0
+        for values in (rise[on], -rise[~on]):
+            if len(values):
+                middle = float(np.median(values))
+                total += float(np.median(np.abs(values - middle))) / middle if middle > 0 else 10.0
+        return total
+
+    grid = np.arange(PHASES) * (2 * math.pi / PHASES)
+    best = grid[np.argmin([unequal(phase) for phase in grid])]
+    width = 2 * math.pi / PHASES
+    return float(minimize_scalar(unequal, bounds=(best - width, best + width), method="bounded").x)
 
 
 @compiled

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import minimize
 
-from polarnet.characterization.estimates import Estimate
-from polarnet.characterization.increments import PixelEvents, chosen_pixels, intervals_of
+from polarnet.characterization.intervals import Estimate, PixelEvents, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.recordings.noise import event_counts, hot_pixels
 from polarnet.simulation.compilation import compiled
@@ -76,12 +75,16 @@ def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"]) -> Noi
     ordinary = chosen_pixels(events, ~hot)
     off = np.bincount(ordinary.pixel[~ordinary.on], minlength=events.pixels)[~hot] / duration_s
     shot_off = float(off.mean())
-    fit, error = _fit_leak(_ages(_few_enough(ordinary)), max(shot_off, 1 / (good * duration_s)))
+    leaks = int(ordinary.on.sum()) - int((~ordinary.on).sum())
+    every = max(1, math.ceil(leaks / MAX_LEAKS), math.ceil(len(ordinary.on) / MAX_AGES))
+    some = chosen_pixels(ordinary, np.arange(events.pixels) % every == 0)
+    fit, error = _fit_leak(_ages(some), max(shot_off, 1 / (good * duration_s)))
     leak, spread, jitter = (
         Estimate(math.exp(x), math.exp(x) * relative, "ages of ON events under constant light")
         for x, relative in zip(fit[1:].tolist(), error[1:].tolist(), strict=True)
     )
-    shot_on = _rate_of_young(_ages(ordinary), YOUNG * math.exp(-fit[1]))
+    ages, young_s = _ages(ordinary), YOUNG * math.exp(-fit[1])  # which the leak does not reach
+    shot_on = float((ages.on & (ages.age_s < young_s)).sum() / np.minimum(ages.age_s, young_s).sum())
     poisson = math.sqrt((shot_on + shot_off) / (good * duration_s))
     between = float(off.std()) / math.sqrt(good)
     return Noise(
@@ -99,24 +102,20 @@ def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"]) -> Noi
 
 
 def rate_swing(times_us: Float64[np.ndarray, " n"], every_us: Float64[np.ndarray, " m"]) -> float:
-    """Relative standard deviation of a rate over equal parts of a recording, less that of a Poisson process.
-
-    `every_us` are the times of all events, which span the recording.
-    """
+    """Relative standard deviation of a rate over the time of all events (`every_us`), less that of Poisson events."""
     if len(times_us) == 0:
         return 0.0
     counts, _ = np.histogram(times_us, SWING_PARTS, (every_us.min(), every_us.max()))
     return math.sqrt(max(counts.var(ddof=1) - counts.mean(), 0.0)) / float(counts.mean())
 
 
-def nominal_shot_noise_hz(
-    rate_hz: float, light: float, relative_deviation_on: float, relative_deviation_off: float
-) -> float:
+def nominal_shot_noise_hz(rate_hz: float, light: float, deviation_on: float, deviation_off: float) -> float:
     """`shot_noise_rate_hz` of a sensor whose pixels fire `rate_hz` (ON and OFF) on average at `light` DN.
 
-    The rate of a pixel is inversely proportional to its thresholds, so the mean exceeds that of a nominal pixel.
+    The rate of a pixel is inversely proportional to its thresholds, so the mean exceeds that of a nominal pixel. The
+    deviations of the thresholds are relative.
     """
-    excess = 0.5 * (mean_inverse(relative_deviation_on) + mean_inverse(relative_deviation_off))
+    excess = 0.5 * (mean_inverse(deviation_on) + mean_inverse(deviation_off))
     return rate_hz / (float(shot_noise_fraction(light)) * excess)
 
 
@@ -127,18 +126,6 @@ def mean_inverse(relative_deviation: float) -> float:
     z, x = z[x >= 1 / NOISE_HOT_FACTOR], x[x >= 1 / NOISE_HOT_FACTOR]
     density = np.exp(-z * z / 2)
     return float((density / x).sum() / density.sum())
-
-
-def _rate_of_young(ages: _Ages, young_s: float) -> float:
-    """ON events per second at ages that the leak does not reach."""
-    return float((ages.on & (ages.age_s < young_s)).sum() / np.minimum(ages.age_s, young_s).sum())
-
-
-def _few_enough(events: PixelEvents) -> PixelEvents:
-    """The events of every k-th pixel, with k large enough for `MAX_LEAKS` and `MAX_AGES`."""
-    leaks = int(events.on.sum()) - int((~events.on).sum())
-    k = max(1, math.ceil(leaks / MAX_LEAKS), math.ceil(len(events.on) / MAX_AGES))
-    return chosen_pixels(events, np.arange(events.pixels) % k == 0)
 
 
 def _ages(events: PixelEvents) -> _Ages:

@@ -1,14 +1,25 @@
-"""Contrast thresholds of each pixel, their mean, deviation and correlation, from increments of known light.
+"""Contrast thresholds of each pixel, how they vary, and the bandwidth, from increments under known light.
 
-An increment that ends with an ON event is one ON threshold, less the leak; one that ends with shot noise is anything
-below. A pixel's threshold is the robust mean of its increments around their most frequent value.
+An increment of duration T that ends with an ON event is (1 - r T) ON thresholds for a leak of r hertz; with an OFF
+event, one OFF threshold plus r T ON thresholds; with shot noise, anything below. A pixel's threshold is the robust mean
+of its increments around their most frequent value. The bandwidth is the one for which increments are closest to one
+threshold.
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.optimize import minimize_scalar
 
+from polarnet.characterization.intervals import GROUPS, MAX_RELATIVE_ERROR, Estimate
+from polarnet.characterization.light import BLOCK, Increments, Source, at_pixels, increments_of
+
+LEAKED = 0.25  # of a threshold: an interval in which the leak alone makes more is not used
+CUTOFF_PIXELS = 600  # pixels that the bandwidth is fitted to
+CUTOFF_GRID = np.geomspace(5, 2500, 14)  # Hz, first guesses
 MIN_INTERVALS = 6  # intervals of one polarity that a pixel needs for a threshold
 FIRST_SCALES = (0.4, 0.25, 0.15, 0.1)  # widths of the robust mean while it approaches the most frequent value
 REFINEMENTS = 12
@@ -40,14 +51,14 @@ def pixel_thresholds(
     increment, pixel, block = increment[positive], pixel[positive], block[positive]
     if len(increment) == 0:
         raise ValueError("expected events that follow the light, got none; check the frames' times and their order")
-    start = np.full(pixels, most_frequent(increment))
+    start = np.full(pixels, _most_frequent(increment))
     near = np.abs(np.log(increment / start[0])) < 0.9
     start = _medians(increment[near], pixel[near], start)
     threshold, scale = start, FIRST_SCALES[0]
     for scale in FIRST_SCALES:
         threshold = _robust_means(increment, pixel, threshold, scale)
     for _ in range(REFINEMENTS):
-        scale = relative_scale(increment, pixel, threshold)
+        scale = _relative_scale(increment, pixel, threshold)
         threshold = _robust_means(increment, pixel, threshold, scale)
     enough = np.bincount(pixel[_near(increment, pixel, threshold, scale)], minlength=pixels) >= MIN_INTERVALS
     halves = []
@@ -62,16 +73,14 @@ def pixel_thresholds(
     return PixelThresholds(np.where(enough, threshold, np.nan), np.stack(halves), scale)
 
 
-def most_frequent(increment: Float64[np.ndarray, " n"]) -> float:
+def _most_frequent(increment) -> float:
     """Most frequent increment, from a histogram of logarithms in bins of 0.1, each with its two neighbours."""
     counts, edges = np.histogram(np.log(increment), np.arange(np.log(0.01), np.log(8.0), 0.1))
     smooth = np.convolve(counts, np.ones(3), "same")
     return float(np.exp(edges[np.argmax(smooth)] + 0.05))
 
 
-def relative_scale(
-    increment: Float64[np.ndarray, " n"], pixel: Int64[np.ndarray, " n"], threshold: Float64[np.ndarray, " pixels"]
-) -> float:
+def _relative_scale(increment, pixel, threshold) -> float:
     """Standard deviation of relative increments around 1, from the upper side, where shot noise does not reach."""
     above = increment / threshold[pixel] - 1
     above = above[(above >= 0) & (above < 0.5)]
@@ -96,12 +105,10 @@ def correlation(on: PixelThresholds, off: PixelThresholds) -> float:
     return float(np.clip(crossed / scale, -1, 1)) if scale > 0 else float("nan")
 
 
-def misfit(
-    increment: Float64[np.ndarray, " n"], pixel: Int64[np.ndarray, " n"], threshold: Float64[np.ndarray, " pixels"]
-) -> float:
+def misfit(increment, pixel, threshold) -> float:
     """Share of increments far from the threshold of their pixel, 0 to 1; small deviations count little."""
-    e = (increment / threshold[pixel] - 1) / MAX_SCALE
-    return float(np.mean(np.minimum(e * e, 1.0) * (3 - 3 * np.minimum(e * e, 1.0) + np.minimum(e * e, 1.0) ** 2)))
+    squared = np.minimum(((increment / threshold[pixel] - 1) / MAX_SCALE) ** 2, 1.0)
+    return float(np.mean(squared * (3 - 3 * squared + squared**2)))
 
 
 def _near(increment, pixel, threshold, scale) -> Bool[np.ndarray, " n"]:
@@ -123,3 +130,73 @@ def _medians(values, pixel, fallback) -> Float64[np.ndarray, " pixels"]:
     counts = np.diff(starts)
     middle = np.minimum(starts[:-1] + counts // 2, max(len(values) - 1, 0))
     return np.where(counts > 0, values[order][middle], fallback)
+
+
+class PolarityThresholds(NamedTuple):
+    """Thresholds of both polarities."""
+
+    on: PixelThresholds
+    off: PixelThresholds
+
+
+def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> PolarityThresholds:
+    """Thresholds of both polarities, with the leak taken out of the increments."""
+    first = _thresholds(data, data.increment, 0.0, pixels)
+    if leak_hz == 0:
+        return first
+    on = np.where(np.isfinite(first.on.threshold), first.on.threshold, np.nanmedian(first.on.threshold))
+    leaked = leak_hz * data.duration_s * on[data.pixel]
+    return _thresholds(data, data.increment + np.where(data.on, leaked, -leaked), leak_hz, pixels)
+
+
+def _thresholds(
+    data: Increments, increment: Float64[np.ndarray, " n"], leak_hz: float, pixels: int
+) -> PolarityThresholds:
+    short = leak_hz * data.duration_s < LEAKED
+    return PolarityThresholds(
+        *(
+            pixel_thresholds(increment[chosen], data.pixel[chosen], data.block[chosen], pixels)
+            for chosen in (data.on & short, ~data.on & short)
+        )
+    )
+
+
+def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
+    """Bandwidth in Hz, from flickers if there are any, else from all sources; None if the data do not determine it."""
+    flickers = [source for source in sources if not source.moves]
+    sources = flickers or sources
+    pixels = sources[0].events.pixels
+    busy = np.flatnonzero(sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK)
+    if len(busy) < GROUPS:
+        return None
+    chosen = busy[:: max(1, len(busy) // CUTOFF_PIXELS)]
+    logs = []
+    for group in range(GROUPS):
+        mask = np.zeros(pixels, bool)
+        mask[chosen[group::GROUPS]] = True
+        some = [at_pixels(source, mask) for source in sources]
+
+        def loss(log_hz: float, some=some) -> float:
+            data = increments_of(some, math.exp(log_hz))
+            try:
+                pair = thresholds_without_leak(data, leak_hz, pixels)
+            except ValueError:
+                return 2.0
+            total = 0.0
+            for of, thresholds in ((data.on, pair.on), (~data.on, pair.off)):
+                valid = of & np.isfinite(thresholds.threshold[data.pixel])
+                total += misfit(data.increment[valid], data.pixel[valid], thresholds.threshold) if valid.any() else 1.0
+            return total
+
+        grid = np.log(CUTOFF_GRID)
+        losses = [loss(x) for x in grid]
+        k = int(np.argmin(losses))
+        if k == 0 or k == len(grid) - 1 or losses[k] > 0.98 * losses[-1]:
+            continue
+        bounds = (grid[k - 1], grid[k + 1])
+        logs.append(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
+    if len(logs) < GROUPS // 2 + 1 or np.std(logs, ddof=1) / math.sqrt(len(logs)) > MAX_RELATIVE_ERROR:
+        return None
+    value = math.exp(float(np.median(logs)))
+    names = " and ".join(source.name for source in sources)
+    return Estimate(value, value * float(np.std(logs, ddof=1)) / math.sqrt(len(logs)), f"{names}, whole increments")

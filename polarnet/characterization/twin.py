@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64
 from scipy.stats import ks_2samp
 
 from polarnet.characterization.fit import SensorFit
-from polarnet.characterization.increments import by_pixel, intervals_of
+from polarnet.characterization.intervals import by_pixel, intervals_of
 from polarnet.characterization.light import Flicker, MovingLight
 from polarnet.events.stream import Events, concatenate, crop, slice_time
 from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
@@ -115,8 +115,8 @@ def compare(
         ratio={key: float((e.p > 0).sum()) / max(int((e.p < 0).sum()), 1) for key, e in pair.items()},
         intervals={key: np.histogram(v, INTERVAL_EDGES_US)[0] / max(len(v), 1) for key, v in intervals_us.items()},
         pixel_rates_hz=rates,
-        interval_distance=_distance(intervals_us["recording"], intervals_us["twin"]),
-        pixel_rate_distance=_distance(rates["recording"], rates["twin"]),
+        interval_distance=_distance(**intervals_us),
+        pixel_rate_distance=_distance(**rates),
     )
 
 
@@ -169,5 +169,5 @@ def _frames_of(
     return constant_frames(values, height, width), t_us
 
 
-def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    return float(ks_2samp(a, b).statistic) if len(a) and len(b) else 1.0
+def _distance(recording: np.ndarray, twin: np.ndarray) -> float:
+    return float(ks_2samp(recording, twin).statistic) if len(recording) and len(twin) else 1.0

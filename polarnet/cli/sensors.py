@@ -72,8 +72,7 @@ def add_to(commands: Commands) -> None:
 
 def _fit_sensor(options: argparse.Namespace) -> int:
     from polarnet.characterization.fit import fit_sensor
-    from polarnet.characterization.known_light import KnownLight
-    from polarnet.characterization.light import Flicker, read_light
+    from polarnet.characterization.light import Flicker, KnownLight, read_light
     from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
     from polarnet.recordings.recording import read_recording
     from polarnet.reports.realism import FitRow, realism_page

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.row_results import RowRecord, write_row
+from polarnet.benchmark.results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp

@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.row_results import read_record, read_rows
+from polarnet.benchmark.results import read_record, read_rows, write_benchmark
 from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
 from polarnet.config.tree import DOLP_TRAINING, Config
 from polarnet.metrics.lpips import NO_RECORD, stored_record

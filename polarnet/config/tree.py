@@ -22,8 +22,7 @@ from polarnet.config.origins import Run
 from polarnet.config.overrides import check_overrides
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
-from polarnet.methods.sharpening import SharpeningConfig
-from polarnet.methods.stokes_gain import GainConfig
+from polarnet.methods.method import GainConfig, SharpeningConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, is_stored, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig

@@ -4,23 +4,18 @@ import importlib
 import pkgutil
 from collections import ChainMap
 from collections.abc import Mapping
-from types import ModuleType
 
 from polarnet.methods.method import Method
 from polarnet.metrics.references import REFERENCES, Reference
 
 
-def _modules() -> list[ModuleType]:
-    return [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
-
-
 def _assembled() -> dict[str, Method]:
-    """Records from the `METHODS` of each module.
+    """Records from the `METHODS` of each module, in alphabetical order within three groups.
 
-    Filters come first, then networks that reconstruct intensities, then networks that predict DoLP. Within each
-    group the modules are in alphabetical order.
+    Filters come first, then networks that reconstruct intensities, then networks that predict DoLP.
     """
-    records = [method for module in _modules() for method in getattr(module, "METHODS", ())]
+    modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
+    records = [method for module in modules for method in getattr(module, "METHODS", ())]
     records.sort(key=lambda method: (method.weights is not None, not method.reconstructs))
     by_name = {method.name: method for method in records}
     assert len(by_name) == len(records), f"two methods have one name: {[method.name for method in records]}"
@@ -40,10 +35,5 @@ ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: 
 
 
 def is_rotating(row: str) -> bool:
-    """Whether a row sees one camera behind a rotating polarizer instead of four channels.
-
-    >>> from polarnet.methods import is_rotating
-    >>> is_rotating("rotating_polarizer"), is_rotating("cf")
-    (True, False)
-    """
+    """Whether a row sees one camera behind a rotating polarizer instead of four channels."""
     return row in METHODS and METHODS[row].rotating

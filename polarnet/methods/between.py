@@ -3,14 +3,12 @@
 A network predicts a frame at the end of each window, at the cost of a whole run. Until the next frame, two cheap
 sources continue it:
 
-- Motion. The displacement between the events of the last two windows is that of the scene
-  (`polarnet.networks.polarnet.panorama.displacements`). The frame keeps moving at this velocity.
+- Motion. The frame keeps moving at the velocity of the events of the last two windows (`panorama.displacements`).
 - Events. log I0 - log I90 = 2 atanh(s1) and log I45 - log I135 = 2 atanh(s2), so an event of threshold c changes
   atanh(s1) or atanh(s2) of its pixel by c / 2.
 
 The events of single pixels are noisy, because thresholds differ between pixels. The change that they count therefore
-replaces the change that the motion predicts only in part (`BetweenConfig.share`), after a mean over neighbouring
-pixels. A frame at time t uses events before t only.
+replaces the change that the motion predicts only in part (`BetweenConfig.share`), after a mean over neighbours.
 """
 
 import dataclasses
@@ -42,8 +40,7 @@ class BetweenConfig:
     """Section `between` of params.yaml: frames between windows (`polarnet recover --rate`)."""
 
     reach: Annotated[int, Field(gt=0, le=1000)]
-    """Search range in pixels for the scene's motion from window to window, along each axis; also the largest
-    displacement of a frame."""
+    """Search range for the scene's motion per window, pixels along each axis; also a frame's largest displacement."""
     share: Annotated[float, Field(ge=0, le=1)]
     """Weight of the change that events count, against the change that the motion predicts; 0: motion alone."""
     width: Annotated[int, Field(gt=0, le=1000)]
@@ -57,7 +54,7 @@ class BetweenConfig:
             raise ValueError(f"width: expected an odd number of pixels, got {self.width}")
 
     def with_thresholds(self, thresholds: Sequence[float] | None) -> "BetweenConfig":
-        """Settings for a camera of these contrast thresholds, ON and OFF; None keeps those that are set."""
+        """Settings for a camera of these contrast thresholds, ON and OFF; None: unchanged."""
         if thresholds is None:
             return self
         return dataclasses.replace(self, threshold_on=thresholds[0], threshold_off=thresholds[1])
@@ -71,11 +68,10 @@ class Between(NamedTuple):
     prediction: Prediction
     """The frame at its end, on the CPU."""
     velocity: Float[Tensor, " 2"]
-    """(x, y) in pixels per microsecond: the point now at p was at p + velocity * t, t microseconds ago; 0 where the
-    events confirm no motion."""
+    """(x, y) in pixels per microsecond, 0 unless events confirm a motion: the point now at p was at p + velocity * t, t
+    microseconds ago."""
     maps: Float[Tensor, "c h2 w2"]
-    """DoLP, the log-variance if predicted, and atanh(s1), atanh(s2) if AoLP is predicted; the border pixels are
-    repeated `reach` + 1 times on each side."""
+    """DoLP, log-variance if predicted, atanh(s1) and atanh(s2) if AoLP is; the border is repeated `reach` + 1 times."""
     change: Float[Tensor, "2 h w"]
     """Change of atanh(s1) and atanh(s2) since the end of the window, counted by the events."""
     t_us: int
@@ -145,12 +141,8 @@ def _counted(
     change = change.clone()
     for events, (row, sign) in zip(channels, CHANNELS, strict=True):
         step = torch.where(events.p > 0, config.threshold_on, -config.threshold_off)
-        change[row].view(-1).index_add_(0, _pixel(events), sign / 2 * step)
+        change[row].view(-1).index_add_(0, events.y.long() * events.width + events.x.long(), sign / 2 * step)
     return change
-
-
-def _pixel(events: Events) -> Tensor:
-    return events.y.long() * events.width + events.x.long()
 
 
 def _shifted(padded: Float[Tensor, "c h2 w2"], displacement: Sequence[float], beyond: int) -> Float[Tensor, "c h w"]:

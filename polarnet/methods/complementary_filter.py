@@ -30,7 +30,7 @@ Image = Float64[np.ndarray, "c h w"]
 
 @section
 class FilterConfig:
-    """Sections `methods.cf` (published defaults) and `methods.highpass` (the package's defaults) of params.yaml."""
+    """Sections `methods.cf` and `methods.highpass` of params.yaml, with their authors' defaults."""
 
     cutoff_hz: NonNegativeFloat
     """Cutoff frequency, below which the scene fades to grey; 0: never."""
@@ -77,32 +77,17 @@ def integrate(state: FilterState, channels: Sequence[Events], t_us: int, config:
     log_intensity, updated_us = state.log_intensity.copy(), state.updated_us.copy()
     settings = config.rate_per_us, config.decay_per_event, config.contrast_on, config.contrast_off
     for number, events in enumerate(channels):
-        columns = (column.numpy() for column in (events.t, events.x, events.y, events.p))
-        if not _integrate(log_intensity[number], updated_us[number], *columns, *settings):
+        columns = events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy()
+        if not _integrate(log_intensity[number], updated_us[number], columns, settings):
             raise ValueError("an event is older than the last event of its pixel; sort the events by time")
     return FilterState(log_intensity, updated_us, t_us)
 
 
-def cf_intensity(log_intensity: Image) -> Image:
-    """I = exp(L) - 1, the complementary filter's intensity."""
-    return np.expm1(log_intensity)
-
-
-def highpass_intensity(log_intensity: Image) -> Image:
-    """I = 1.5 exp(L) - 1, the high-pass filter's intensity."""
-    return HIGHPASS_GAIN * np.exp(log_intensity) - 1
-
-
-def image_of(state: FilterState, config: FilterConfig, intensity: Callable[[Image], Image]) -> Float64[Tensor, "c h w"]:
-    """Intensity at the time of the state; `config.intensity_range` becomes [0, 1], intensities outside are clipped."""
-    logs = state.log_intensity * np.exp(-config.rate_per_us * (state.t_us - state.updated_us))
-    low, high = config.intensity_range
-    return torch.from_numpy(((intensity(logs) - low) / (high - low)).clip(0, 1))
-
-
 @numba.njit(nogil=True, cache=True)
 @no_type_check
-def _integrate(log_intensity, updated_us, t, x, y, p, rate_per_us, per_event, contrast_on, contrast_off):
+def _integrate(log_intensity, updated_us, columns, settings):
+    t, x, y, p = columns
+    rate_per_us, per_event, contrast_on, contrast_off = settings
     for i in range(len(t)):
         row, column = y[i], x[i]
         elapsed = t[i] - updated_us[row, column]
@@ -113,6 +98,21 @@ def _integrate(log_intensity, updated_us, t, x, y, p, rate_per_us, per_event, co
         log_intensity[row, column] = decay * log_intensity[row, column] + step
         updated_us[row, column] = t[i]
     return True
+
+
+def highpass_intensity(log_intensity: Image) -> Image:
+    """I = 1.5 exp(L) - 1, the high-pass filter's intensity."""
+    return HIGHPASS_GAIN * np.exp(log_intensity) - 1
+
+
+def image_of(state: FilterState, config: FilterConfig, intensity: Callable[[Image], Image]) -> Float64[Tensor, "c h w"]:
+    """Intensity at the time of the state, as a function of log intensity: expm1 for the complementary filter.
+
+    `config.intensity_range` becomes [0, 1], intensities outside are clipped.
+    """
+    logs = state.log_intensity * np.exp(-config.rate_per_us * (state.t_us - state.updated_us))
+    low, high = config.intensity_range
+    return torch.from_numpy(((intensity(logs) - low) / (high - low)).clip(0, 1))
 
 
 def open_filter(setup: Setup, intensity: Callable[[Image], Image]) -> Recoverer:
@@ -133,7 +133,7 @@ CF = Method(
     name="cf",
     label="CF",
     colour="#e08a1e",
-    open=functools.partial(open_filter, intensity=cf_intensity),
+    open=functools.partial(open_filter, intensity=np.expm1),
     config=FilterConfig,
     reconstructs=True,
     about="The complementary filter without frames (Scheerlinck et al. 2018): intensity from events, one polarizer at "

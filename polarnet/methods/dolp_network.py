@@ -1,8 +1,11 @@
-"""Recurrent networks that predict DoLP from the events of a window, as methods."""
+"""Recurrent networks that predict DoLP from the events of a window, as methods: polarnet's, the paper's and E2P.
 
+E2P (Mei et al., CVPR 2023) takes the four channels interleaved as a mosaic of twice the height and width.
+"""
+
+import functools
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import torch
@@ -10,19 +13,29 @@ from jaxtyping import Float
 from pydantic import Field, PositiveFloat
 from torch import Tensor, nn
 
-from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts
+from polarnet.events.mosaic import join_mosaic
+from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, Setup, State, each_map, weights_file
-from polarnet.methods.two_threads import Sharing
-from polarnet.methods.window_length import of_any_length
+from polarnet.methods.intensity_networks import load_baseline, voxel_grids
+from polarnet.methods.method import (
+    Method,
+    Recoverer,
+    Setup,
+    State,
+    Weights,
+    each_map,
+    no_state,
+    weights_file,
+    windows_at_once,
+)
+from polarnet.methods.overlap import of_any_length
 from polarnet.networks.base.checkpoint import trained_window_us
+from polarnet.networks.e2p.network import MOSAIC, E2p, angle_of, interleaved
 from polarnet.networks.polarnet.stokes_unet import MAX_BINNING, Binning, StokesUNet
 from polarnet.networks.registry import NETWORKS, load_network
 from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
-
-DOLP_NETWORKS = tuple(NETWORKS)
 
 
 @section
@@ -35,11 +48,6 @@ class DolpNetworkConfig:
     """Side in pixels of the blocks that the network sees (`networks.polarnet.binning`); null: as in its training."""
 
 
-def encoded(windows: Sequence[EventWindow], encode: Encode) -> Float[Tensor, "n c h w"]:
-    """Encode every window, with the channels concatenated along the second axis."""
-    return torch.stack([_encoded(window, encode) for window in windows])
-
-
 def dolp_recoverer(
     network: nn.Module,
     metadata: Mapping[str, Any],
@@ -48,74 +56,45 @@ def dolp_recoverer(
     thresholds: Sequence[float] | None = None,
     binning: int | None = None,
 ) -> Recoverer:
-    """Wrap a network and the metadata of its checkpoint (`load_network`) as a method.
+    """Wrap a network and the metadata of its checkpoint (`load_network`) as a method for windows of any length.
 
-    `precision` is fp32 or bf16 (autocast). Two threads share runs of many windows (`polarnet.methods.two_threads`).
-    Windows may have any length (`polarnet.methods.window_length`). `thresholds` are the camera's contrast thresholds,
-    ON and OFF (`told`), and `binning` is the side of the pixel blocks that the network sees (default: that of its
-    training).
+    `precision` is fp32 or bf16 (autocast). `thresholds` (ON, OFF) replace the network's own estimate, and `binning`
+    the side of the pixel blocks that it sees. ValueError for another network than polarnet's, which alone has these
+    options, or a value out of range.
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-    encode = REPRESENTATIONS[metadata["representation"]]
-    if thresholds is not None:
-        encode = told(ready, metadata, thresholds)
+    for option, value in (("thresholds", thresholds), ("binning", binning)):
+        if value is not None and not isinstance(ready, StokesUNet):
+            raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
     if binning is not None:
-        _bin(ready, metadata, binning)
-
-    def autocast() -> torch.autocast:
-        return torch.autocast(place.type, torch.bfloat16, enabled=precision == "bf16")
-
-    def encode_on_device(windows: Sequence[EventWindow]) -> Float[Tensor, "n 1 c h w"]:
-        return encoded(windows, encode)[:, None].to(place)
+        if not 1 <= binning <= MAX_BINNING:
+            raise ValueError(f"binning: expected blocks with a side of 1 to {MAX_BINNING} px, got {binning}")
+        ready.binning = binning
+    encode = REPRESENTATIONS[metadata["representation"]] if thresholds is None else _told(ready, thresholds)
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        if sharing is not None and len(parts := sharing.parts(windows)) > 1:
-            return sharing.predict(state, parts)
-        with autocast():
-            prediction, state = ready.unroll(encode_on_device(windows), state)
+        inputs = torch.stack([_encoded(window, encode) for window in windows])
+        with torch.autocast(place.type, torch.bfloat16, enabled=precision == "bf16"):
+            prediction, state = ready.unroll(inputs[:, None].to(place), state)
         return state, each_map(prediction, lambda field: field[:, 0])
 
-    recoverer, sharing = Recoverer(lambda height, width: None, predict, network=ready), None
-    if isinstance(ready, StokesUNet) and place.type == "cpu":
-        sharing = Sharing(ready, encode_on_device, autocast, ThreadPoolExecutor(1))
-        recoverer = recoverer._replace(at_once=sharing.at_once)
+    def at_once(height: int, width: int) -> int:
+        side = ready.binning if isinstance(ready, StokesUNet) else 1
+        return windows_at_once(height // side, width // side)
+
+    recoverer = Recoverer(no_state, predict, network=ready, at_once=at_once)
     trained_us = trained_window_us(metadata)
     return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
 
 
-def open_dolp_network(setup: Setup) -> Recoverer:
-    """Open the DoLP network from the checkpoint in the setup."""
-    network, metadata = load_network(weights_file(setup))
-    options = (setup.config.thresholds, setup.config.binning) if isinstance(setup.config, DolpNetworkConfig) else ()
-    return dolp_recoverer(network, metadata, setup.device, setup.precision, *options)
-
-
-def told(network: nn.Module, metadata: Mapping[str, Any], thresholds: Sequence[float]) -> Encode:
-    """Tell a network the camera's contrast thresholds (ON, OFF), and return the encoding of events that it then needs.
-
-    The network uses their geometric mean instead of its own estimate, and each event counts as its threshold over this
-    mean. ValueError if a threshold is not above 0, or for a network that estimates no threshold.
-    """
+def _told(network: StokesUNet, thresholds: Sequence[float]) -> Encode:
+    """Give a network the mean of the camera's thresholds; each event counts as its threshold over this mean."""
     if min(thresholds) <= 0:
         raise ValueError(f"thresholds: expected numbers above 0 (ON, OFF), got {list(thresholds)}")
     mean = math.sqrt(math.prod(thresholds))
-    unet = _stokes_unet(network, metadata, "thresholds")
-    unet.scale.given = mean / unet.step
+    network.scale.given = mean / network.step
     return weighted_counts([threshold / mean for threshold in thresholds])
-
-
-def _bin(network: nn.Module, metadata: Mapping[str, Any], side: int) -> None:
-    if not 1 <= side <= MAX_BINNING:
-        raise ValueError(f"binning: expected blocks with a side of 1 to {MAX_BINNING} px, got {side}")
-    _stokes_unet(network, metadata, "binning").binning = side
-
-
-def _stokes_unet(network: nn.Module, metadata: Mapping[str, Any], option: str) -> StokesUNet:
-    """Return the network if it is polarnet's own, which alone has this option; ValueError for another network."""
-    if not isinstance(network, StokesUNet):
-        raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
-    return network
 
 
 def weighted_counts(steps: Sequence[float]) -> Encode:
@@ -132,3 +111,68 @@ def weighted_counts(steps: Sequence[float]) -> Encode:
 def _encoded(window: EventWindow, encode: Encode) -> Float[Tensor, "c h w"]:
     images = [encode(events, window.length_us) for events in window.channels]
     return torch.cat([image.view(-1, *image.shape[-2:]) for image in images])
+
+
+def open_dolp_network(setup: Setup) -> Recoverer:
+    """Open the DoLP network from the checkpoint in the setup."""
+    network, metadata = load_network(weights_file(setup))
+    options = (setup.config.thresholds, setup.config.binning) if isinstance(setup.config, DolpNetworkConfig) else ()
+    return dolp_recoverer(network, metadata, setup.device, setup.precision, *options)
+
+
+def open_e2p(setup: Setup, *, published: bool) -> Recoverer:
+    """Open E2P; its authors' weights (`published`) saw one voxel grid of the whole mosaic, polarnet's one a channel."""
+    network = load_baseline({"e2p": E2p}, weights_file(setup)).to(setup.device)
+
+    def grid(window: EventWindow) -> Float[Tensor, "bins h w"]:
+        if published:
+            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins)
+        return interleaved(voxel_grids(window, network.bins))
+
+    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+        frames = []
+        for window in windows:
+            with setup.autocast():
+                maps, state = network(grid(window).to(setup.device)[None], state)
+            frames.append(maps[0].float())
+        maps = torch.stack(frames)
+        return state, Prediction(maps[:, -1], angle_of(maps))
+
+    return Recoverer(no_state, predict, network=network)
+
+
+METHODS = (
+    Method(
+        name="e2p",
+        label="E2P",
+        colour="#7a5cc4",
+        open=functools.partial(open_e2p, published=False),
+        weights=Weights(("e2p",)),
+        about="E2P (Mei et al. 2023), a published network from events to polarization.",
+    ),
+    Method(
+        name="e2p_published",
+        label="E2P, published weights",
+        colour="#7a5cc4",
+        open=functools.partial(open_e2p, published=True),
+        weights=Weights(("e2p",)),
+    ),
+    Method(
+        name="paper",
+        label="the paper's network",
+        colour="#0ca678",
+        open=open_dolp_network,
+        weights=Weights(tuple(NETWORKS)),
+        about="The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
+        "DoLP out.",
+    ),
+    Method(
+        name="ours",
+        label="ours",
+        colour="#d6336c",
+        open=open_dolp_network,
+        config=DolpNetworkConfig,
+        weights=Weights(tuple(NETWORKS), shipped=True),
+        about="The DoLP network in use.",
+    ),
+)

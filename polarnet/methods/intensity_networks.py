@@ -7,23 +7,35 @@ its authors do not sharpen. Row `e2v` is the one that the pipeline trains.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
-from polarnet.methods import sharpening
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.method import Method, Recoverer, Setup, State, Weights, weights_file
+from polarnet.methods.method import (
+    Method,
+    Recoverer,
+    Setup,
+    SharpeningConfig,
+    State,
+    Weights,
+    no_state,
+    weights_file,
+)
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2v import ARCHITECTURES
 from polarnet.networks.e2v.e2vid import E2vid
 from polarnet.networks.e2v.firenet import FireNet
 from polarnet.stokes import Prediction
+
+KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
 
 Networks = Mapping[str, Any]
 """Class of each network that a method accepts, by the name in its checkpoints."""
@@ -54,12 +66,24 @@ def intensity_methods(
 ) -> tuple[Method, Method]:
     """The method NAME that runs one of `networks`, and NAME+gain.
 
-    See `intensity_network` for `normalised` and `sharpened`.
+    `normalised` scales voxel grids to mean 0 and standard deviation 1, as in E2VID. `sharpened` applies the
+    post-processing of E2VID's authors; otherwise intensities are on their true scale and only clipped.
     """
 
     def open_network(setup: Setup) -> Recoverer:
-        network = load_baseline(networks, weights_file(setup))
-        return intensity_network(network, setup, normalised=normalised, sharpened=sharpened)
+        network = load_baseline(networks, weights_file(setup)).to(setup.device)
+
+        def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+            images = []
+            for window in windows:
+                grids = voxel_grids(window, network.bins).to(setup.device)
+                with setup.autocast():
+                    intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
+                images.append(intensity.float())
+            raw = torch.stack(images)
+            return state, from_intensities(sharper(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
+
+        return Recoverer(no_state, predict, network=network)
 
     method = Method(
         name=name,
@@ -74,45 +98,43 @@ def intensity_methods(
     return method, with_gain(method)
 
 
-def intensity_network(network: Any, setup: Setup, *, normalised: bool = True, sharpened: bool = False) -> Recoverer:
-    """Wrap a network as a method that reconstructs intensities.
-
-    `normalised` scales voxel grids to mean 0 and standard deviation 1, as in E2VID. `sharpened` applies the
-    post-processing of E2VID's authors; otherwise intensities are on their true scale and only clipped.
-    """
-    network = network.to(setup.device)
-
-    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        images = []
-        for window in windows:
-            grids = voxel_grids(window, network.bins).to(setup.device)
-            with setup.autocast():
-                intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
-            images.append(intensity.float())
-        raw = torch.stack(images)
-        return state, from_intensities(sharpening.sharpened(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
-
-    return Recoverer(lambda height, width: None, predict, network=network)
-
-
 def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "c bins h w"]:
     """Voxel grid of each channel."""
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
 
 
+def sharper(images: Float[Tensor, "t c h w"], config: SharpeningConfig) -> Float[Tensor, "t c h w"]:
+    """Post-processing by E2VID's authors: (1 + amount) image - amount blurred, mirrored at the border, then clipped.
+
+    The authors then round images to 8 bits; polarnet does not.
+    """
+    if config.unsharp_amount == 0:
+        return images.clamp(0, 1)
+    kernel = blur_kernel(config.unsharp_sigma).to(images)[None, None]
+    padded = F.pad(images.flatten(0, 1)[:, None], (KERNEL_SIZE // 2,) * 4, mode="reflect")
+    blurred = F.conv2d(padded, kernel).view_as(images)
+    return ((1 + config.unsharp_amount) * images - config.unsharp_amount * blurred).clamp(0, 1)
+
+
+def blur_kernel(sigma: float) -> Float[Tensor, "5 5"]:
+    """The published kernel: square root of the outer product of 5 normal bin probabilities, with sum 1.
+
+    The bins lie in [-sigma - step / 2, sigma + step / 2] of the standard normal, step = (2 sigma + 1) / 5.
+    """
+    step = (2 * sigma + 1) / KERNEL_SIZE
+    edges = torch.linspace(-sigma - step / 2, sigma + step / 2, KERNEL_SIZE + 1, dtype=torch.float64)
+    shares = torch.tensor([NormalDist().cdf(edge) for edge in edges.tolist()], dtype=torch.float64).diff()
+    kernel = torch.outer(shares, shares).sqrt()
+    return kernel / kernel.sum()
+
+
+FIRENET = {"firenet": FireNet}
 METHODS = (
     *intensity_methods("e2v", "E2V", "#3d8fd9", ARCHITECTURES, about="Events to video."),
     *intensity_methods("e2vid_published", "E2VID, published weights", "#2f6fb0", {"e2vid": E2vid}, sharpened=True),
+    *intensity_methods("firenet_published", "FireNet, published weights", "#3d8fd9", FIRENET, sharpened=True),
     *intensity_methods(
-        "firenet_published", "FireNet, published weights", "#3d8fd9", {"firenet": FireNet}, sharpened=True
-    ),
-    *intensity_methods(
-        "firenetplus_published",
-        "FireNet+, published weights",
-        "#3d8fd9",
-        {"firenet": FireNet},
-        normalised=False,
-        sharpened=True,
+        "firenetplus_published", "FireNet+, published weights", "#3d8fd9", FIRENET, normalised=False, sharpened=True
     ),
     *intensity_methods(
         "cista_tc",

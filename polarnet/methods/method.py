@@ -3,23 +3,49 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.sharpening import SharpeningConfig
-from polarnet.methods.stokes_gain import GainConfig
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes at once; bounds the memory of a network
 
 State = Any
 """State of a method before a window: tensors, or None at the start."""
+
+
+@section
+class SharpeningConfig:
+    """Section `methods.sharpening` of params.yaml: post-processing by E2VID's authors, with their defaults."""
+
+    unsharp_amount: NonNegativeFloat
+    """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
+    unsharp_sigma: PositiveFloat
+    """Width of the blur, in the units of the published kernel."""
+
+
+@section
+class GainConfig:
+    """Section `methods.gain` of params.yaml: the gains of NAME+gain."""
+
+    window_frames: PositiveInt
+    """Number of frames that determine the gains of a frame: the frame and those before it."""
+    rounds: NonNegativeInt
+    """Number of reweighting rounds by how well pixels fit; 0: equal weights."""
+    pixels: Annotated[int, Field(ge=4)]
+    """Maximum number of pixels used from these frames, evenly spread."""
+    smallest: Annotated[float, Field(gt=0, le=1)]
+    """Lower bound of a gain, as a fraction of the gain that makes all four channels equally bright."""
+    pull: NonNegativeFloat
+    """Regularisation towards equal brightness, relative to the pixels' mean square, for poorly determined gains."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +75,10 @@ class Setup:
 def windows_at_once(height: int, width: int) -> int:
     """Number of windows of this size in pixels that a method processes at once."""
     return max(1, PIXELS_AT_ONCE // (height * width))
+
+
+def no_state(height: int, width: int) -> None:
+    """State before the first event of a network that makes its own."""
 
 
 class Recoverer(NamedTuple):
@@ -115,9 +145,7 @@ class Method:
     """Glossary sentence of the HTML pages. For a row with several possible networks or published weights, it states
     the difference from the network's own sentence; empty if that sentence suffices."""
     wraps: "Method | None" = None
-    """Wrapped method, whose predictions `convert` turns into those of this method."""
-    convert: Callable[[Setup, State, Prediction], tuple[State, Prediction]] | None = None
-    """(setup, state (None at the start), prediction of the wrapped method) -> (new state, prediction)."""
+    """Method whose section and weights this one uses."""
 
     @property
     def section(self) -> str:
@@ -137,8 +165,7 @@ class Method:
 def weights_file(setup: Setup) -> Path:
     """Path of a method's weights; FileNotFoundError if there is no file."""
     if setup.weights is None or not setup.weights.exists():
-        reason = "no weights are given" if setup.weights is None else f"{setup.weights} is missing"
-        raise FileNotFoundError(reason)
+        raise FileNotFoundError("no weights are given" if setup.weights is None else f"{setup.weights} is missing")
     return setup.weights
 
 
@@ -158,16 +185,11 @@ def why_absent(method: Method, setup: Setup) -> str | None:
 
 
 def weights_record(method: Method, setup: Setup) -> dict[str, str]:
-    """File name, sha256 and network of a method's weights; FileNotFoundError or ValueError if it has none."""
-    if method.weights is None:
-        raise ValueError(f"{method.name} needs no weights, so there is no record of them")
+    """File name, sha256 and network of the weights of a method that needs some; FileNotFoundError without a file."""
+    assert method.weights is not None, method.name
     path = weights_file(setup)
-    own = path.suffix == ".safetensors"
-    return {
-        "file": path.name,
-        "sha256": sha256(path),
-        "network": load_checkpoint(path)[1]["network"] if own else method.weights.networks[0],
-    }
+    network = load_checkpoint(path)[1]["network"] if path.suffix == ".safetensors" else method.weights.networks[0]
+    return {"file": path.name, "sha256": sha256(path), "network": network}
 
 
 def clamped(prediction: Prediction) -> Prediction:

@@ -1,26 +1,33 @@
-"""Run a method over the windows of a stream, whether they overlap or not.
+"""Run a method over windows of any length, whether they overlap or not.
 
 Networks are trained on consecutive windows, 1/30 s long in the paper; their state summarises all earlier windows.
-For DoLP at a higher rate, shorter windows would change the kind of input. Passing the state between overlapping
-windows would count most events many times. A window therefore starts from the newest state whose window ended no
-later than this window starts.
 
-Consecutive windows pass their state on directly. If windows of length n S start every S, each window continues the
-window n steps earlier, as if n cameras ran with shifted windows. Every event then counts exactly once in each of
-these n series. If the step does not divide the length, events in the gap before a window are missed.
+For DoLP at a higher rate, windows overlap. Passing the state from each to the next would count most events many times.
+A window therefore starts from the newest state whose window ended no later than this window starts (`advance`). If
+windows of length n S start every S, each continues the window n steps earlier, as if n cameras ran with shifted
+windows, and every event counts exactly once in each of these n series. If the step does not divide the length, events
+in the gap before a window are missed.
+
+The sums, recurrent layers and gains of a network fit the window length of its training (`of_any_length`). Shorter
+windows are joined with earlier ones up to about that length, and longer windows are cut into parts of about that
+length. The method still returns one frame for each window it is given.
 """
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from polarnet.events.stream import Events
+import torch
+
+from polarnet.events.stream import Events, concatenate, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, State
+from polarnet.methods.method import Recoverer, State, each_map
 from polarnet.stokes import Prediction
 
 STATES_PER_WINDOW = 64
 """Maximum number of states per window length; with finer steps, up to 1/64 of a window is missed."""
 BEFORE_ALL_US = -(2**63)
+SAME = 1.5  # windows whose length is the trained one within this factor are used as they are
 
 History = tuple[tuple[int, State], ...]
 """Pairs of a window's end (microseconds) and the state after that window, oldest first."""
@@ -57,3 +64,62 @@ def warm_up(recoverer: Recoverer, height: int, width: int, channels: int = 4) ->
     state = recoverer.start(height, width)
     for k in range(2):  # without and with a state
         state, _ = recoverer.step(state, [EventWindow(nothing, 1000 * k, 1000 * (k + 1))])
+
+
+class Recent(NamedTuple):
+    """State of `of_any_length` between windows."""
+
+    history: History
+    windows: tuple[EventWindow, ...]
+    """Latest windows, together about as long as those of the training; empty unless they are shorter."""
+
+
+def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
+    """Wrap a method trained on windows of `trained_us` microseconds, for windows of any length."""
+
+    def start(height: int, width: int) -> Recent:
+        return Recent(begin(recoverer, height, width), ())
+
+    def predict(state: Recent, windows: Sequence[EventWindow]) -> tuple[Recent, Prediction]:
+        if all(trained_us / SAME <= window.length_us <= trained_us * SAME for window in windows):
+            history, prediction = advance(recoverer, state.history, windows)
+            return Recent(history, ()), prediction
+        frames = []
+        for window in windows:
+            parts, recent = _parts(window, trained_us), _recent(state.windows, window, trained_us)
+            if len(parts) == 1:
+                parts = [_joined(recent)]
+            history, prediction = advance(recoverer, state.history, parts)
+            state = Recent(history, recent)
+            frames.append(each_map(prediction, lambda field: field[-1]))
+        fields = zip(*frames, strict=True)
+        maps = [None if field[0] is None else torch.stack(field) for field in fields]
+        return state, Prediction(*maps)  # type: ignore[arg-type]
+
+    return recoverer._replace(start=start, predict=predict)
+
+
+def _recent(before: Sequence[EventWindow], window: EventWindow, trained_us: int) -> tuple[EventWindow, ...]:
+    """Return the latest windows without gaps whose joint length is nearest to `trained_us`, at least the last one."""
+    last = [window]
+    for earlier in reversed(before):
+        more = window.stop_us - earlier.start_us
+        if earlier.stop_us != last[0].start_us or more - trained_us > trained_us - (window.stop_us - last[0].start_us):
+            break
+        last.insert(0, earlier)
+    return tuple(last)
+
+
+def _joined(windows: Sequence[EventWindow]) -> EventWindow:
+    channels = [concatenate(parts) for parts in zip(*(window.channels for window in windows), strict=True)]
+    return EventWindow(channels, windows[0].start_us, windows[-1].stop_us)
+
+
+def _parts(window: EventWindow, trained_us: int) -> list[EventWindow]:
+    """Cut a window into equal parts of about `trained_us`."""
+    number = max(1, round(window.length_us / trained_us))
+    ends = [window.start_us + round(k * window.length_us / number) for k in range(number + 1)]
+    return [
+        EventWindow([slice_time(events, start, stop) for events in window.channels], start, stop)
+        for start, stop in itertools.pairwise(ends)
+    ]

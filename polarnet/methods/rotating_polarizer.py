@@ -29,7 +29,6 @@ from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 from polarnet.stokes import Prediction
 
-UNKNOWNS = 3
 MIN_EVENTS = 3  # as many as there are unknowns
 PIVOT_MIN = 1e-12
 
@@ -92,11 +91,18 @@ def fit_half_turn(
     return dolp, torch.where(aolp >= math.pi, 0.0, aolp), variance.log()
 
 
-def rotating_recoverer(config: RotatingPolarizerConfig, rotation: Rotation) -> Recoverer:
-    """Wrap the fit as a method; the sensor's events may be in any channel, and the other channels are empty."""
+def local_variance(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w"]:
+    """Variance over the square of `side` pixels around each pixel, cut off at the border."""
+    moments = torch.stack([frame.double(), frame.double().square()])[None]
+    mean, square = F.avg_pool2d(moments, side, 1, side // 2, count_include_pad=False)[0]
+    return (square - mean.square()).clamp(min=0).float()
 
-    def start(height: int, width: int) -> Events:
-        return Events.empty(height, width)
+
+def open_rotating(setup: Setup) -> Recoverer:
+    """Wrap the fit as a method; the events may be in any channel, the others are empty. ValueError if no rotation."""
+    config, rotation = setup.config, setup.rotation
+    if rotation is None:
+        raise ValueError("expected the rotation of the polarizer too: --rotating HZ or --triggers FILE")
 
     def predict(recent: Events, windows: Sequence[EventWindow]) -> tuple[Events, Prediction]:
         maps = []
@@ -106,25 +112,7 @@ def rotating_recoverer(config: RotatingPolarizerConfig, rotation: Rotation) -> R
             recent = slice_time(recent, math.floor(window.stop_us - rotation.half_turn_us), window.stop_us)
         return recent, Prediction(*(torch.stack(one) for one in zip(*maps, strict=True)))
 
-    return Recoverer(start, predict)
-
-
-def local_variance(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w"]:
-    """Variance over the square of `side` pixels around each pixel, cut off at the border."""
-    values = frame.double()
-    return (local_mean(values.square(), side) - local_mean(values, side).square()).clamp(min=0).float()
-
-
-def local_mean(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w"]:
-    """Mean over the square of `side` pixels around each pixel, cut off at the border."""
-    return F.avg_pool2d(frame[None, None], side, 1, side // 2, count_include_pad=False)[0, 0]
-
-
-def open_rotating(setup: Setup) -> Recoverer:
-    """Open the fit for the rotation in the setup; ValueError if there is none."""
-    if setup.rotation is None:
-        raise ValueError("expected the rotation of the polarizer too: --rotating HZ or --triggers FILE")
-    return rotating_recoverer(setup.config, setup.rotation)
+    return Recoverer(Events.empty, predict)
 
 
 @compiled
@@ -159,7 +147,7 @@ def _fit(
         row[6] += inverse * c
         row[7] += inverse * s
     for i in range(count):
-        if fitted[2, i] < UNKNOWNS:
+        if fitted[2, i] < MIN_EVENTS:
             continue
         w, wc, ws, cc, cs, ss, yc, ys = sums[i]
         cc, ss = cc + ridge * w, ss + ridge * w

@@ -21,16 +21,8 @@ pytestmark = pytest.mark.usefixtures("brief_costs")
 
 
 def config(**changes):
-    values = {
-        "methods": list(ROWS),
-        "sets": ["simulated"],
-        "warmup_windows": 1,
-        "precision": "fp32",
-        "lpips": False,
-        "lpips_backbone": "alex",
-        "bootstrap_samples": 50,
-    }
-    return BenchmarkConfig(**{**values, "panel_scenes": 2, **changes})
+    settings = BenchmarkConfig(list(ROWS), ["simulated"], 1, "fp32", False, "alex", 50, 2)
+    return dataclasses.replace(settings, **changes)
 
 
 def test_a_test_sequence_has_the_truth_at_the_end_of_each_window(five_scenes, make_sequence):

@@ -38,10 +38,6 @@ def test_a_model_is_described_by_the_parameters_that_it_has(config):
     assert drawn.endswith("model exact, cutoff_hz, leak_rate_hz drawn for each sequence (emulate.randomise).")
 
 
-def test_the_conditions_of_the_training_give_no_warning(config):
-    assert warnings(configured(config.synthesize, config.emulate), {"ours": checkpoint(config)}, "Set") == []
-
-
 def test_a_difference_is_said_with_both_values_and_what_to_set(config):
     used = configured(dataclasses.replace(config.synthesize, sensor_height=60, duration_s=0.4), config.emulate)
     assert warnings(used, {"ours": checkpoint(config), "e2v": checkpoint(config)}, "Set") == [
@@ -97,7 +93,8 @@ def test_a_pixel_model_is_compared_with_the_names_that_the_training_drew(config)
     assert line.endswith("Set emulate.model=exact")
 
 
-def test_a_drawn_sensor_is_a_difference_for_a_training_that_drew_none(config):
+def test_a_drawn_sensor_is_a_difference_for_a_training_that_drew_none_and_its_own_conditions_are_none(config):
+    assert warnings(configured(config.synthesize, config.emulate), {"ours": checkpoint(config)}, "Set") == []
     random = dataclasses.replace(config.emulate, randomise={"cutoff_hz": [30.0, 300.0]})
     (line,) = warnings(configured(config.synthesize, random), {"ours": checkpoint(config)}, "Set")
     assert "emulate.randomise {cutoff_hz:[30.0,300.0]} (training: null)" in line

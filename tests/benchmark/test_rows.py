@@ -5,7 +5,7 @@ import torch
 
 from polarnet.benchmark.rows import available, metadata_used, predictions_of, weights_used
 from polarnet.events.stream import Events
-from polarnet.methods import METHODS, ROWS
+from polarnet.methods import ROWS
 from polarnet.metrics.references import oracle_mean
 from polarnet.metrics.similarity import mse
 
@@ -48,20 +48,6 @@ def test_the_oracle_knows_the_mean_of_the_valid_pixels_alone():
     for frame, mean, where in zip(truth, best, valid, strict=True):
         expected = frame[where].mean() if where.any() else torch.tensor(0.0)
         torch.testing.assert_close(mean, expected.expand(4, 5))
-
-
-def test_a_method_and_its_gains_share_one_run(sequence, context, monkeypatch):
-    method, runs = METHODS["cf"], []
-
-    def counted(setup):
-        recoverer = method.open(setup)
-        return recoverer._replace(start=lambda height, width: runs.append("cf") or recoverer.start(height, width))
-
-    alone = dolp_of("cf+gain", sequence, context)
-    monkeypatch.setitem(METHODS, "cf", dataclasses.replace(method, open=counted))
-    predictions = predictions_of(["cf+gain", "cf"], sequence, context)
-    assert runs == ["cf"]
-    assert torch.equal(predictions["cf+gain"].dolp, alone)
 
 
 def test_a_row_that_cannot_run_is_left_out_with_the_reason(make_context, tmp_path):

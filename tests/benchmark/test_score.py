@@ -27,17 +27,8 @@ def row(scene, value, method="m", sequence=None, window=0, lpips=None, aolp_deg=
 
 
 def config(**changes):
-    values = {
-        "methods": ["zeros"],
-        "sets": ["simulated"],
-        "warmup_windows": 1,
-        "precision": "fp32",
-        "lpips": False,
-        "lpips_backbone": "alex",
-        "bootstrap_samples": 10,
-        "panel_scenes": 1,
-    }
-    return BenchmarkConfig(**{**values, **changes})
+    settings = BenchmarkConfig(["zeros"], ["simulated"], 1, "fp32", False, "alex", 10, 1)
+    return dataclasses.replace(settings, **changes)
 
 
 def test_a_constant_offset_scores_its_square_as_level(sequence):
@@ -46,11 +37,8 @@ def test_a_constant_offset_scores_its_square_as_level(sequence):
     assert [r.window for r in rows] == [0, 1, 2, 3]
     assert [r.t_us for r in rows] == [1000, 2000, 3000, 4000]
     for r in rows:
-        assert r.mse == pytest.approx(0.01)
-        assert r.psnr == pytest.approx(20)
-        assert r.level_mse == pytest.approx(0.01)
-        assert r.pattern_mse == pytest.approx(0, abs=1e-9)
-        assert r.corr == pytest.approx(1)
+        scores = (r.mse, r.psnr, r.level_mse, r.pattern_mse, r.corr)
+        assert scores == pytest.approx((0.01, 20, 0.01, 0, 1), abs=1e-6)
         assert r.lpips is None
 
 
@@ -69,14 +57,9 @@ def test_a_frame_that_is_not_a_number_is_named_not_dropped(sequence, bad):
         score_sequence(sequence, {"m": Prediction(spoilt)}, 0, None, CPU)
 
 
-def test_a_sequence_with_nothing_left_after_the_warm_up_is_refused(sequence):
-    with pytest.raises(
-        ValueError, match=r"a has 4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"
-    ):
+def test_frames_that_cannot_be_scored_are_refused(sequence):
+    with pytest.raises(ValueError, match=r"4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"):
         score_sequence(sequence, {"m": Prediction(sequence.dolp)}, 4, None, CPU)
-
-
-def test_frames_of_another_size_are_refused(sequence):
     with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
         score_sequence(sequence, {"m": Prediction(sequence.dolp[:3])}, 0, None, CPU)
 
@@ -143,11 +126,6 @@ def test_the_angle_is_scored_where_there_is_one(sequence):
     assert "without" not in scene_means(rows, "aolp_deg")
 
 
-def test_an_angle_for_some_frames_alone_is_refused():
-    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
-        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
-
-
 def test_lpips_that_was_not_computed_is_null_without_an_interval():
     table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
     assert table["lpips"] is None
@@ -155,9 +133,11 @@ def test_lpips_that_was_not_computed_is_null_without_an_interval():
     assert summary([row("x", 1.0, lpips=0.5)], 10, 0)["m"]["lpips"] == 0.5
 
 
-def test_a_method_that_lacks_a_scene_is_named():
+def test_a_method_that_lacks_a_scene_or_the_angle_of_some_frames_is_named():
     with pytest.raises(ValueError, match=r"b has no score for \['y'\]"):
         summary([row("x", 1.0, "a"), row("y", 1.0, "a"), row("x", 1.0, "b")], 10, 0)
+    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
+        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
 
 
 def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tmp_path):

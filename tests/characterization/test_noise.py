@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from event_fixtures import events_of
 
-from polarnet.characterization.increments import PixelEvents
+from polarnet.characterization.intervals import PixelEvents
 from polarnet.characterization.noise import (
     estimate_noise,
     hot_under_constant_light,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from event_fixtures import events_of
 
-from polarnet.characterization.increments import by_pixel, intervals_of, undisturbed
-from polarnet.characterization.light import MovingLight, moving_responses
-from polarnet.characterization.thresholds import correlation, deviation, pixel_thresholds
+from polarnet.characterization.intervals import by_pixel, intervals_of, undisturbed
+from polarnet.characterization.light import Increments, MovingLight, moving_responses
+from polarnet.characterization.thresholds import correlation, deviation, pixel_thresholds, thresholds_without_leak
 
 
 def constructed(deviation_on: float, noise: float, shots: float, seed: int = 0, pixels: int = 2000, each: int = 40):
@@ -33,9 +33,8 @@ def test_events_of_a_ramp_give_their_threshold_exactly():
 def test_intervals_start_and_end_at_events_of_the_same_pixel():
     events = by_pixel(events_of([(10, 0, 0, 1), (20, 1, 0, 1), (40, 0, 0, -1), (50, 1, 0, 1)], 1, 2))
     intervals = intervals_of(events)
-    assert intervals.duration_us.tolist() == [30, 30]
-    assert intervals.pixel.tolist() == [0, 1]
-    assert intervals.on.tolist() == [False, True]
+    columns = (intervals.duration_us.tolist(), intervals.pixel.tolist(), intervals.on.tolist())
+    assert columns == ([30, 30], [0, 1], [False, True])
 
 
 def test_an_interval_at_the_refractory_period_and_the_one_after_it_do_not_count():
@@ -70,3 +69,15 @@ def test_equal_maps_correlate_fully_and_independent_ones_do_not():
 def test_events_that_never_follow_the_light_are_refused():
     with pytest.raises(ValueError, match="frames' times"):
         pixel_thresholds(np.full(100, -0.2), np.zeros(100, np.int64), np.zeros(100, np.int64), 1)
+
+
+def test_thresholds_are_those_without_the_leak():
+    """A leak of 0.3 Hz over a second moves an increment by 0.3 ON thresholds, fifteen standard deviations."""
+    generator = np.random.default_rng(1)
+    pixel, n = np.repeat(np.arange(400), 200), 80_000
+    on, duration_s = generator.random(n) < 0.5, generator.exponential(0.1, n)
+    leaked = 0.3 * 0.3 * duration_s
+    increment = np.where(on, 0.3 - leaked, 0.15 + leaked) + 0.006 * generator.standard_normal(n)
+    thresholds = thresholds_without_leak(Increments(increment, duration_s, pixel, on, np.arange(n) // 8), 0.3, 400)
+    assert np.median(thresholds.on.threshold) == pytest.approx(0.3, rel=0.003)
+    assert np.median(thresholds.off.threshold) == pytest.approx(0.15, rel=0.003)

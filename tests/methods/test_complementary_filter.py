@@ -8,7 +8,6 @@ from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.methods.complementary_filter import (
     FilterConfig,
     at_rest,
-    cf_intensity,
     highpass_intensity,
     image_of,
     integrate,
@@ -54,7 +53,7 @@ def reconstructed(intensity, channels, t_us, config):
 
 
 def reconstruct_cf(channels, t_us, config):
-    return reconstructed(cf_intensity, channels, t_us, config)
+    return reconstructed(np.expm1, channels, t_us, config)
 
 
 def reconstruct_highpass(channels, t_us, config):

@@ -12,17 +12,17 @@ from polarnet.events.representations import event_counts, event_tensor, voxel_gr
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow, encode_windows
 from polarnet.methods import METHODS
-from polarnet.methods.dolp_network import dolp_recoverer, told, weighted_counts
+from polarnet.methods.dolp_network import dolp_recoverer, weighted_counts
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.intensity_networks import intensity_network, load_baseline
+from polarnet.methods.intensity_networks import intensity_methods, load_baseline, sharper
 from polarnet.methods.method import Method, Recoverer, weights_record, why_absent
-from polarnet.methods.sharpening import sharpened
 from polarnet.networks.e2p.network import E2p, interleaved
 from polarnet.networks.e2v.firenet import FireNet
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
 from polarnet.networks.registry import load_network
 from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
 
+COUNTS = {"network": "polarnet", "representation": "event_counts"}
 RECONSTRUCTING = [name for name, method in METHODS.items() if method.reconstructs and method.wraps is None]
 
 
@@ -61,22 +61,15 @@ def test_every_method_gives_a_frame_a_window_between_0_and_1(name, sequence, ope
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_windows_at_once_give_what_they_give_one_by_one(name, sequence, open_method):
+def test_windows_at_once_give_what_they_give_one_by_one_and_a_step_changes_no_state(name, sequence, open_method):
     recoverer, windows = open_method(name), sequence.windows
     together = recovered(recoverer, windows)
     state = recoverer.start(sequence.events[0].height, sequence.events[0].width)
     for k, window in enumerate(windows):
-        state, one = recoverer.step(state, [window])
+        before = state
+        state, one = recoverer.step(before, [window])
+        assert torch.equal(recoverer.step(before, [window])[1].dolp, one.dolp)  # neither has changed
         assert_same(one, Prediction(together.dolp[k : k + 1], None if one.aolp is None else together.aolp[k : k + 1]))
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_a_step_changes_neither_the_method_nor_the_state_it_was_given(name, sequence, open_method):
-    recoverer, (first, second, *_) = open_method(name), sequence.windows
-    state, _ = recoverer.step(recoverer.start(sequence.events[0].height, sequence.events[0].width), [first])
-    _, once = recoverer.step(state, [second])
-    _, again = recoverer.step(state, [second])
-    assert torch.equal(once.dolp, again.dolp)
 
 
 def test_filters_come_first_then_reconstructions_then_networks_of_dolp():
@@ -130,14 +123,11 @@ def test_reconstructions_treat_the_four_polarizers_alike(name, sequence, open_me
     torch.testing.assert_close(shifted, straight.roll(-1, dims=1))
 
 
-@pytest.mark.parametrize("name", RECONSTRUCTING)
-def test_every_reconstruction_has_a_row_with_its_gains_solved_that_shares_its_run(name, sequence, make_setup):
-    method, solved = METHODS[name], METHODS[f"{name}+gain"]
-    assert (solved.wraps, solved.section, solved.label) == (method, name, f"{method.label}, gains solved")
-    setup = make_setup(name)
-    _, shared = solved.convert(setup, None, recovered(method.open(setup), sequence.windows))
-    alone = recovered(solved.open(setup), sequence.windows)
-    assert torch.equal(shared.dolp.float().clamp(0, 1), alone.dolp)
+def test_every_reconstruction_has_a_row_with_its_gains_solved():
+    for name in RECONSTRUCTING:
+        solved = METHODS[f"{name}+gain"]
+        assert (solved.wraps, solved.section) == (METHODS[name], name)
+        assert solved.label == f"{METHODS[name].label}, gains solved"
 
 
 def reconstructing(intensities):
@@ -159,11 +149,6 @@ def test_solved_gains_undo_what_a_method_left_unknown(sequence, make_setup):
     assert not torch.allclose(recovered(method.open(setup), sequence.windows).dolp, dolp, atol=0.1)
 
 
-def test_gains_need_intensities(sequence, make_setup):
-    with pytest.raises(ValueError, match="e2p reconstructs no intensities"):
-        recovered(with_gain(METHODS["e2p"]).open(make_setup("e2p")), sequence.windows)
-
-
 def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_they_are(
     sequence, make_setup, open_method
 ):
@@ -173,9 +158,9 @@ def test_published_networks_are_post_processed_and_firenet_plus_sees_voxels_as_t
     with torch.no_grad():
         raw, _ = network.unroll(grids)
     intensities = recovered(open_method("firenetplus_published"), sequence.windows).intensities
-    torch.testing.assert_close(intensities, sharpened(raw, setup.sharpening))
-    normalised = intensity_network(network, setup, sharpened=True)
-    assert not torch.allclose(intensities, recovered(normalised, sequence.windows).intensities)
+    torch.testing.assert_close(intensities, sharper(raw, setup.sharpening))
+    (normalised, _) = intensity_methods("m", "m", "#000000", {"firenet": FireNet}, sharpened=True)
+    assert not torch.allclose(intensities, recovered(normalised.open(setup), sequence.windows).intensities)
 
 
 def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
@@ -221,25 +206,25 @@ def stokes_unet(project_root):
 
 
 def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, stokes_unet):
-    events = sequence.windows[0].channels[0]
-    encode = told(stokes_unet, {"network": "polarnet"}, (0.1, 0.4))
+    given = recovered(dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.4)), sequence.windows[:1])
     assert stokes_unet.scale.given == pytest.approx(0.2 / stokes_unet.step)
-    assert torch.equal(encode(events, 1), weighted_counts((0.5, 2.0))(events, 1))
+    inputs = encode_windows(sequence.events, sequence.t_us[:2], weighted_counts((0.5, 2.0)))[:, None]
+    with torch.no_grad():
+        torch.testing.assert_close(given.dolp, stokes_unet.unroll(inputs)[0].dolp[:, 0].clamp(0, 1))
 
 
 def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
     with pytest.raises(ValueError, match="expected network polarnet, got paper; leave thresholds out"):
-        told(torch.nn.Identity(), {"network": "paper"}, (0.1, 0.1))
+        dolp_recoverer(torch.nn.Identity(), COUNTS | {"network": "paper"}, thresholds=(0.1, 0.1))
     with pytest.raises(ValueError, match="expected numbers above 0"):
-        told(stokes_unet, {"network": "polarnet"}, (0.1, 0.0))
+        dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.0))
 
 
 def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, project_root):
     coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
     coarse.load_state_dict(stokes_unet.state_dict())
-    metadata = {"network": "polarnet", "representation": "event_counts"}
-    told_at_use = recovered(dolp_recoverer(stokes_unet, metadata, binning=2), sequence.windows)
-    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, metadata), sequence.windows).dolp)
+    told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows)
+    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows).dolp)
 
 
 @pytest.mark.parametrize(
@@ -249,9 +234,10 @@ def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, p
         ("polarnet", 9, "side of 1 to 8 px, got 9"),
     ],
 )
-def test_binning_that_cannot_be_is_refused(network, side, words):
+def test_binning_that_cannot_be_is_refused(network, side, words, stokes_unet):
+    chosen = stokes_unet if network == "polarnet" else torch.nn.Identity()
     with pytest.raises(ValueError, match=words):
-        dolp_recoverer(torch.nn.Identity(), {"network": network, "representation": "event_counts"}, binning=side)
+        dolp_recoverer(chosen, COUNTS | {"network": network}, binning=side)
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):
@@ -283,14 +269,10 @@ def test_weights_that_are_missing_or_of_another_network_are_refused(open_method,
 
 
 def test_weights_are_named_by_their_hash_and_network(make_setup, checkpoints):
-    content = checkpoints["firenet"].read_bytes()
-    assert weights_record(METHODS["e2v"], make_setup("e2v")) == {
-        "file": "firenet.safetensors", "sha256": hashlib.sha256(content).hexdigest(), "network": "firenet"
-    }  # fmt: skip
-
-
-def test_weights_name_the_network_behind_a_row_whose_key_does_not(make_setup):
-    for name, network in {"ours": "paper", "e2v": "firenet", "cista_tc": "cista_tc"}.items():
+    digest = hashlib.sha256(checkpoints["firenet"].read_bytes()).hexdigest()
+    record = {"file": "firenet.safetensors", "sha256": digest, "network": "firenet"}
+    assert weights_record(METHODS["e2v"], make_setup("e2v")) == record
+    for name, network in {"ours": "paper", "cista_tc": "cista_tc"}.items():
         assert weights_record(METHODS[name], make_setup(name))["network"] == network
 
 

@@ -15,7 +15,7 @@ from polarnet.methods.rotating_polarizer import (
     RotatingPolarizerConfig,
     fit_half_turn,
     local_variance,
-    rotating_recoverer,
+    open_rotating,
 )
 from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import Sine, Trajectory
@@ -24,16 +24,9 @@ from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.truth import frames_of
 
 IDEAL = RotatingPolarizerConfig(
-    threshold_on=0.2,
-    threshold_off=0.2,
-    cutoff_hz=0.0,
-    level_dn=60.0,
-    ridge=1e-9,
-    silent_dolp=0.1,
-    spread_window=3,
-    spread_scale=1.0,
-    variance_floor=1e-4,
-)
+    threshold_on=0.2, threshold_off=0.2, cutoff_hz=0.0, level_dn=60.0, ridge=1e-9, silent_dolp=0.1,
+    spread_window=3, spread_scale=1.0, variance_floor=1e-4,
+)  # fmt: skip
 """For events exactly at the thresholds of the logarithm."""
 DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
 AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])
@@ -73,12 +66,13 @@ def test_a_pixel_with_two_events_counts_as_silent():
     assert log_variance.exp().numpy() == pytest.approx(np.full((2, 3), 1e-4))
 
 
-def test_only_the_last_half_turn_counts_however_the_events_are_cut_into_windows():
+def test_only_the_last_half_turn_counts_however_the_events_are_cut_into_windows(make_setup):
     rotation = steady_rotation(4.0)
     before, after = exact_events(DOLP[::-1], AOLP, rotation, 500_000), exact_events(DOLP, AOLP, rotation, 500_000)
     late = slice_time(after, 375_000, 500_000)
     alone = fit_half_turn(late, rotation, 500_000, IDEAL)
-    recoverer, empty = rotating_recoverer(IDEAL, rotation), Events.empty(2, 3)
+    setup = make_setup("rotating_polarizer", config=IDEAL, rotation=rotation)
+    recoverer, empty = open_rotating(setup), Events.empty(2, 3)
     cuts = [0, 375_000, 400_000, 470_000, 500_000]
     windows = [
         EventWindow([empty, slice_time(late if start >= 375_000 else before, start, stop), empty, empty], start, stop)

@@ -1,7 +1,6 @@
 """The emulate stage killed with SIGKILL, by itself and on a Dask cluster: the rerun redoes only what is missing.
 
-Stages start in children of a process that has imported the stage once, so that ten deaths take seconds and not a
-minute. With POLARNET_SLOW=1 the same deaths befall `python -m stages.emulate` with two workers, each from a cold start.
+Stages start in children of a process that has imported the stage once, so that ten deaths take seconds.
 """
 
 import contextlib
@@ -10,7 +9,6 @@ import hashlib
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -84,38 +82,19 @@ def run_stage(arguments: list[str]) -> None:
     stages.emulate.main()
 
 
-@pytest.fixture(scope="module")
-def start_forked() -> Callable[[list[str]], Running]:
-    def start(arguments: list[str]) -> Running:
-        process = FORKSERVER.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
-        process.start()
-        pid = process.pid
-        assert pid is not None
-        until(lambda: os.getpgid(pid) == pid)  # else the signal would find no such group
+def start(arguments: list[str]) -> Running:
+    process = FORKSERVER.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
+    process.start()
+    pid = process.pid
+    assert pid is not None
+    until(lambda: os.getpgid(pid) == pid)  # else the signal would find no such group
 
-        def wait() -> int:
-            process.join(PATIENCE_S)
-            assert process.exitcode is not None, "the stage hangs"
-            return process.exitcode
+    def wait() -> int:
+        process.join(PATIENCE_S)
+        assert process.exitcode is not None, "the stage hangs"
+        return process.exitcode
 
-        return Running(pid, wait)
-
-    return start
-
-
-@pytest.fixture(scope="module")
-def start_cold(project_root: Path) -> Callable[[list[str]], Running]:
-    if not os.environ.get("POLARNET_SLOW"):
-        pytest.skip("POLARNET_SLOW is not set: ten cold starts take two minutes")
-
-    def start(arguments: list[str]) -> Running:
-        command = [sys.executable, "-m", "stages.emulate", *arguments, "runtime.workers=2"]
-        process = subprocess.Popen(
-            command, cwd=project_root, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, process_group=0
-        )
-        return Running(process.pid, lambda: process.wait(PATIENCE_S))
-
-    return start
+    return Running(pid, wait)
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -135,9 +114,9 @@ def identities(store: Path) -> dict[str, tuple[int, int]]:
 
 
 def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda: True) -> None:
-    start = time.monotonic()
+    latest = time.monotonic() + PATIENCE_S
     while not true() and still_worth_it():
-        assert time.monotonic() - start < PATIENCE_S, "nothing happens"
+        assert time.monotonic() < latest, "nothing happens"
         time.sleep(0.001)
 
 
@@ -150,31 +129,27 @@ class Undisturbed(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(folder: Path, start_forked: Callable[[list[str]], Running]) -> Undisturbed:
+def undisturbed(folder: Path) -> Undisturbed:
     events = folder.parent / "undisturbed" / "events.zarr"
-    start_forked(overrides(folder, events.with_name("warm.zarr"))).wait()  # compiles what is not compiled yet
-    start = time.monotonic()
-    running = start_forked(overrides(folder, events))
+    start(overrides(folder, events.with_name("warm.zarr"))).wait()  # compiles what is not compiled yet
+    begin = time.monotonic()
+    running = start(overrides(folder, events))
     until(lambda: bool(finished(events.with_name("events.zarr.tmp"))))
     first = time.monotonic()
     assert running.wait() == 0
-    return Undisturbed(digest(events), first - start, (time.monotonic() - first) / (PARTS - 1))
+    return Undisturbed(digest(events), first - begin, (time.monotonic() - first) / (PARTS - 1))
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("start", ["start_forked", "start_cold"])
-def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(
-    folder, start, undisturbed, tmp_path, request
-):
+def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(folder, undisturbed, tmp_path):
     """Half of the deaths come before a run has finished anything, half up to 1.5 parts after its first."""
-    begin = request.getfixturevalue(start)
     events, unfinished = tmp_path / "events.zarr", tmp_path / "events.zarr.tmp"
     generator = np.random.default_rng(SEED)
     known: dict[str, tuple[int, int]] = {}
     deaths = []
     while len(deaths) < KILLS:
         done = len(finished(unfinished))
-        running = begin(overrides(folder, events))
+        running = start(overrides(folder, events))
         if len(deaths) % 2:
             until(lambda done=done: len(finished(unfinished)) > done, lambda: not events.exists())
             time.sleep(generator.uniform(0, 1.5 * undisturbed.seconds_each))
@@ -193,7 +168,7 @@ def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(
         known = identities(unfinished)
         deaths.append(len(finished(unfinished)))
     assert max(deaths) > 0
-    assert begin(overrides(folder, events)).wait() == 0
+    assert start(overrides(folder, events)).wait() == 0
     assert identities(events).items() >= known.items()
     assert digest(events) == undisturbed.digests
     assert not unfinished.exists()

@@ -3,8 +3,7 @@ import json
 
 import pytest
 
-from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.row_results import RowRecord, read_record, read_rows, write_row
+from polarnet.benchmark.results import RowRecord, read_record, read_rows, write_benchmark, write_row
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 

@@ -1,0 +1,129 @@
+"""Pairs of consecutive events of a pixel, and the refractory period from the shortest of them.
+
+Between the two events of a pair, the filtered log light changes by one threshold.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from polarnet.events.stream import Events
+
+GROUPS = 8  # groups of pixels, whose differences give standard errors
+MAX_RELATIVE_ERROR = 0.5  # an estimate with a larger standard error is discarded
+PILE_UP = 3.0  # intervals of 0.9 to 1.1 times the shortest, over those of 1.1 to 1.3 times the shortest
+MIN_TICKS = 5  # ticks of the recording's clock in the shortest refractory period that can be measured
+SHORTEST = 5  # rank of the interval that shot noise is judged by, so that a few false events do not count
+MAX_ERROR = 0.05  # relative; without a refractory period the error is about as large as the estimate
+
+
+class Estimate(NamedTuple):
+    """A parameter of the sensor."""
+
+    value: float
+    error: float
+    """Standard error."""
+    source: str  # recordings and events behind the estimate, in words
+
+
+class PixelEvents(NamedTuple):
+    """Events of one recording ordered by pixel, then time."""
+
+    pixel: Int64[np.ndarray, " n"]
+    t_us: Float64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+    pixels: int
+    """Number of pixels of the sensor."""
+
+
+class Intervals(NamedTuple):
+    """Pairs of consecutive events of one pixel. `start` and `stop` index `PixelEvents`."""
+
+    start: Int64[np.ndarray, " m"]
+    stop: Int64[np.ndarray, " m"]
+    pixel: Int64[np.ndarray, " m"]
+    on: Bool[np.ndarray, " m"]
+    """Polarity of the event at the end."""
+    duration_us: Float64[np.ndarray, " m"]
+
+
+def by_pixel(events: Events) -> PixelEvents:
+    """The events ordered by pixel, then time."""
+    pixel = events.y.numpy().astype(np.int64) * events.width + events.x.numpy()
+    order = np.argsort(pixel, kind="stable")  # events are in time order already
+    return PixelEvents(
+        pixel[order],
+        events.t.numpy()[order].astype(np.float64),
+        events.p.numpy()[order] > 0,
+        events.height * events.width,
+    )
+
+
+def chosen_pixels(events: PixelEvents, chosen: Bool[np.ndarray, " pixels"]) -> PixelEvents:
+    """The events of some pixels."""
+    selected = chosen[events.pixel]
+    return PixelEvents(events.pixel[selected], events.t_us[selected], events.on[selected], events.pixels)
+
+
+def intervals_of(events: PixelEvents) -> Intervals:
+    """All pairs of consecutive events of a pixel."""
+    start = np.flatnonzero(events.pixel[1:] == events.pixel[:-1])
+    stop = start + 1
+    return Intervals(start, stop, events.pixel[stop], events.on[stop], events.t_us[stop] - events.t_us[start])
+
+
+def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3) -> Intervals:
+    """Intervals longer than `margin` times the refractory period, except those right after a shorter one.
+
+    A crossing within the refractory period waits for its end: its increment exceeds one threshold, and the next
+    increment lacks the excess.
+    """
+    free = intervals.duration_us > margin * refractory_us
+    after_waiting = np.zeros(len(free), bool)
+    follows = intervals.start[1:] == intervals.stop[:-1]
+    after_waiting[1:] = follows & ~free[:-1]
+    usable = free & ~after_waiting
+    return Intervals(*(column[usable] for column in intervals))
+
+
+def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate | None:
+    """Shortest interval, if intervals pile up there: crossings within the refractory period waited for its end."""
+    durations = np.concatenate(durations_us) if durations_us else np.empty(0)
+    durations = np.sort(durations[durations > 0])
+    supported = max(5, int(1e-5 * len(durations)))
+    if len(durations) <= supported:
+        return None
+    shortest = durations[supported]
+    if shortest < MIN_TICKS * _tick_us(durations):
+        return None  # a coarse clock piles intervals up as well
+    edges = np.searchsorted(durations, shortest * np.array([0.9, 1.1, 1.3]))
+    piled, next_to = np.diff(edges)
+    if piled < 20 or piled < PILE_UP * next_to:
+        return None
+    near = durations[edges[0] : edges[1]]
+    return Estimate(float(np.median(near)), float(near.std()) / math.sqrt(len(near)), "shortest intervals of a pixel")
+
+
+def between_shot_noise_us(durations_us: Float64[np.ndarray, " _"]) -> Estimate | None:
+    """Refractory period from intervals under constant light.
+
+    Shot noise is a Poisson process that pauses for the refractory period. Just above it, the density of intervals is
+    constant, so the k-th shortest interval exceeds it by k over the density.
+    """
+    durations = np.sort(durations_us[durations_us > 0])
+    if len(durations) < SHORTEST:
+        return None
+    shortest = durations[SHORTEST - 1]
+    density = (np.searchsorted(durations, 3 * shortest) - SHORTEST) / (2 * shortest)
+    value, error = shortest - SHORTEST / max(density, 1e-12), math.sqrt(SHORTEST) / max(density, 1e-12)
+    if error > MAX_ERROR * value or shortest < MIN_TICKS * _tick_us(durations):
+        return None
+    return Estimate(float(value), float(error), "shortest intervals of shot noise")
+
+
+def _tick_us(durations: Float64[np.ndarray, " _"]) -> float:
+    """Step of the recording's clock."""
+    return float(np.gcd.reduce(np.rint(durations).astype(np.int64)))
