@@ -136,7 +136,7 @@ def stokes_frames(
     for number, (time_us, frame) in enumerate(itertools.zip_longest(t_us, frames)):
         if time_us is None or frame is None:
             more = "more frames" if time_us is None else "more times"
-            raise ValueError(f"expected one time for each frame, got {more} than {number}; give as many times as frames")
+            raise ValueError(f"expected one time a frame, got {more} than {number}; give as many times as frames")
         if isinstance(frame, PolarizationScene):
             check_scene(frame)
         scene = frame if isinstance(frame, PolarizationScene) else scene_from_rgb(frame)
