@@ -191,7 +191,8 @@ def parallel_coordinates(values: Mapping[str, Sequence[str]], scores: Sequence[f
         levels.append((scores[number] - min(scores)) / span)
         best = number == int(np.argmin(scores))
         axes.plot(levels, color=colours(scaled(scores[number])), linewidth=3.0 if best else 1.3)
-    for place, height in enumerate([*heights, {f"{min(scores):.4f}": 0, f"{max(scores):.4f}": 1}]):
+    heights.append({f"{min(scores):.4f}": 0.0, f"{max(scores):.4f}": 1.0})
+    for place, height in enumerate(heights):
         for value, level in height.items():
             axes.text(place + 0.04, level, value, fontsize=8, va="bottom", color=LIGHT.text)
     axes.set_xticks(range(len(values) + 1), [*values, score_label], fontsize=8)

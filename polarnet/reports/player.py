@@ -127,7 +127,7 @@ def _strip(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> dict[str, Any]:
     rows = np.concatenate([*frames])
     done, data = cv2.imencode(".webp", rows, [cv2.IMWRITE_WEBP_QUALITY, QUALITY[kind]])
     assert done, f"OpenCV could not encode a strip of {frames.shape}"
-    return {**about, "strip": f"data:image/webp;base64,{base64.b64encode(data).decode()}"}
+    return {**about, "strip": f"data:image/webp;base64,{base64.b64encode(data.tobytes()).decode()}"}
 
 
 def _reduced(frames: UInt8[np.ndarray, "n h w"], kind: Kind) -> UInt8[np.ndarray, "n h2 w2"]:
