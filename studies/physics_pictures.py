@@ -22,7 +22,6 @@ from polarnet.events.stream import Events
 from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
-from polarnet.reports.overview import OFF, ON
 from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_out, weights_of
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
@@ -39,6 +38,7 @@ from polarnet.stokes import (
     stokes_from_intensities,
     stokes_from_polarization,
 )
+from studies.overview import OFF, ON
 from studies.simulation_pictures import LINE, QUIET, photograph, write_pictures
 from studies.study import ROOT
 

@@ -39,17 +39,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from polarnet.analysis.between_windows import frames_between
-from polarnet.analysis.resimulate import resimulated, sequence_at
+from polarnet.analysis.event_budget import sequence_at
 from polarnet.benchmark.rows import Context, available, opened, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
+from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
 from polarnet.methods import METHODS
+from polarnet.methods.between import anchored, carried
+from polarnet.methods.method import Recoverer, clamped
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
+from polarnet.simulation.motion import Trajectory, frame_times_us
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.scene import scene_from_polarization
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
@@ -162,7 +167,7 @@ def scored_sequence(
     name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
-    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    test = simulated(scenes, name, config)
     first_context = next(iter(contexts.values()))
     rows, _ = available(ROWS, first_context)
     predictions = predictions_of(rows, test, first_context)
@@ -184,7 +189,7 @@ def scored_sequence(
 
 def rated_sequence(name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context]) -> Scores:
     """Scores of the frames between windows and at their ends, without the windows of the warm-up."""
-    test = resimulated(scenes, name, config.synthesize, [config.camera] * 4, config.seed)
+    test = simulated(scenes, name, config)
     warmup, cpu = warmup_windows(config), torch.device("cpu")
     spans = list(itertools.pairwise(test.t_us.tolist()))[warmup + 1 :]
     times = [
@@ -194,12 +199,50 @@ def rated_sequence(name: str, scenes: SceneStore, config: Config, contexts: Mapp
     predictions = predictions_of(["oracle_mean"], later, next(iter(contexts.values())))
     at_ends = {}
     for row, context in contexts.items():
-        frames = frames_between(test, times, opened(METHODS[OURS], context), config.between)
-        predictions |= {row: frames.carried, row + HELD: frames.held}
-        at_ends[row + ENDS] = frames.at_ends
+        at_ends[row + ENDS], predictions[row], predictions[row + HELD] = frames_between(
+            test, times, opened(METHODS[OURS], context), config
+        )
     rows = score_sequence(later, predictions, 0, None, cpu) + score_sequence(test, at_ends, warmup, None, cpu)
     truth = later.dolp if later.valid is None else later.dolp[later.valid]
     return Scores(rows, {rows[0].scene: float(truth.mean())}, {})
+
+
+def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
+    """A stored scene with the events of the configured camera, which moves as when the scene was made."""
+    record = scenes.read(name)
+    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    t_us = torch.tensor(frame_times_us(config.synthesize))
+    size = scenes.sensor_height, scenes.sensor_width
+    events = emulate_motion(config.camera.drawn(config.seed, name), scene, trajectory, int(t_us[-1]), size, 1)
+    return sequence_at(scenes, name, events, t_us)
+
+
+@torch.no_grad()
+def frames_between(
+    sequence: TestSequence, times_us: Sequence[int], recoverer: Recoverer, config: Config
+) -> list[Prediction]:
+    """Frames at the ends of the windows; at the increasing times, each window's frame carried on; and held there."""
+    windows = sequence.windows
+    assert times_us[0] >= windows[0].stop_us, "no frame exists before the end of the first window"
+    state, before = recoverer.start(*sequence.dolp.shape[1:]), None
+    at_ends, on, held = [], [], []
+    for window, end_us in zip(windows, [*(one.stop_us for one in windows[1:]), times_us[-1] + 1], strict=True):
+        state, prediction = recoverer.step(state, [window])
+        frame = Prediction(*(None if field is None else field[0].cpu() for field in prediction))  # type: ignore[arg-type]
+        before = anchored(before, window, frame, config.between)
+        at_ends.append(frame)
+        for time_us in (t for t in times_us if window.stop_us <= t < end_us):
+            before, later = carried(before, sequence.events, time_us, config.between)
+            on.append(later)
+            held.append(frame)
+    return [joined(frames) for frames in (at_ends, on, held)]
+
+
+def joined(frames: Sequence[Prediction]) -> Prediction:
+    """DoLP, AoLP and log-variance of several frames, stacked."""
+    maps = [None if fields[0] is None else torch.stack(fields) for fields in list(zip(*frames, strict=True))[:3]]
+    return clamped(Prediction(*maps))  # type: ignore[arg-type]
 
 
 def warmup_windows(config: Config) -> int:

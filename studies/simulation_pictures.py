@@ -24,13 +24,13 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import event_image, png
-from polarnet.reports.overview import OFF, ON
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from studies.overview import OFF, ON
 
 FOLDER = Path("docs") / "pictures"
 PHOTO = "coffee.png"

@@ -32,7 +32,6 @@ SLOWEST_FIRST = (
     "benchmark/test_results.py",
     "cli/test_wheel.py",
     "reports/test_browser.py",
-    "reports/test_curves.py",
     "cli/test_studies.py",
     "runtime/test_environment.py",
     "runtime/test_cluster.py",

@@ -1,1 +1,1 @@
-"""Studies of a method beyond its scores: event budget, sensitivity to sensor and motion, real recordings."""
+"""Beyond the scores of a method: event budget, conditions of a comparison, recordings with truth."""

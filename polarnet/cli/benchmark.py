@@ -1,4 +1,4 @@
-"""Command that scores methods: on your own scenes or recordings, or in studies of the pipeline's test sequences."""
+"""Command that scores methods on your own scenes or recordings, or studies the pipeline's event budget."""
 
 import argparse
 import contextlib
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 --scenes simulates event sequences from the pictures of a folder, runs every method whose weights are available,
 prints the table and writes it with a page; it trains nothing. --recordings does the same on recordings of a camera
-with a polarizer mosaic that hold frames. --event-budget and --sensitivity study the pipeline's own test sequences.
+with a polarizer mosaic that hold frames. --event-budget studies the pipeline's own test sequences.
 params.yaml sets sizes, motion and sensor."""
 
 EXAMPLES = """\
@@ -33,7 +33,7 @@ def add_to(commands: Commands) -> None:
     """Add the command benchmark."""
     benchmark = commands.add_parser(
         "benchmark",
-        help="score every method on your own scenes or recordings, or study event budget and sensitivity",
+        help="score every method on your own scenes or recordings, or study the event budget",
         description=DESCRIPTION,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -49,9 +49,6 @@ def add_to(commands: Commands) -> None:
         help="recordings with frames: HDF5 of E2P, AEDAT-2 and AEDAT4 of a DAVIS, subfolders included",
     )
     asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
-    asked.add_argument(
-        "--sensitivity", action="store_true", help="quality against threshold mismatch, noise, speed and channel errors"
-    )
     benchmark.add_argument(
         "--weights",
         type=Path,
@@ -92,7 +89,7 @@ def _benchmark(options: argparse.Namespace) -> int:
     settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
     folder = working_folder()
     root = own.resolve() if own else None
-    name = root.name if root else "event_budget" if options.event_budget else "sensitivity"
+    name = root.name if root else "event_budget"
     out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
     weights = options.weights.resolve() if options.weights else None
     cleaning = cleaning_of(options)
@@ -131,11 +128,10 @@ def _own_folder(
 
 
 def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Path | None) -> int:
-    from polarnet.cli.studies import STUDIED, run_event_budget, run_sensitivity
+    from polarnet.cli.studies import STUDIED, run_event_budget
 
-    run = run_event_budget if options.event_budget else run_sensitivity
     methods = options.methods.split(",") if options.methods else STUDIED
-    with run_folder(out, f"benchmark {'--event-budget' if options.event_budget else '--sensitivity'}") as folder:
-        run(config, folder, methods, options.limit, weights)
+    with run_folder(out, "benchmark --event-budget") as folder:
+        run_event_budget(config, folder, methods, options.limit, weights)
     print(f"wrote to {out}: {', '.join(sorted(path.name for path in out.iterdir() if path.name != MARKER))}")
     return 0

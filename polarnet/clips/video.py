@@ -98,15 +98,10 @@ def video_pieces(
         here = [frame for frame in true if frame.t_us <= chunk[-1].t_us]
         true = true[len(here) :]
         t_us = torch.tensor([frame.t_us for frame in here])
-        yield Piece(chunk[-1].t_us, events, t_us, _truth(here, channels.height, channels.width))
-
-
-def _truth(frames: Sequence[StokesFrame], rows: int, columns: int) -> Float32[Tensor, "n 3 h w"]:
-    """Stokes parameters on the pixels of a channel."""
-    if not frames:
-        return torch.empty(0, 3, rows, columns)
-    stokes = torch.stack([frame.stokes for frame in frames])
-    return stokes if stokes.shape[2] == rows else torch.nn.functional.avg_pool2d(stokes, 2)
+        truth = torch.stack([frame.stokes for frame in here]) if here else torch.empty(0, 3, height, width)
+        if height > channels.height:
+            truth = torch.nn.functional.avg_pool2d(truth, 2)
+        yield Piece(chunk[-1].t_us, events, t_us, truth)
 
 
 def simulate_video(
@@ -119,10 +114,9 @@ def simulate_video(
 ) -> list[Events]:
     """Events of the four channels of a camera at rest, each pixel of which sees one pixel of `frames`.
 
-    Frames are RGB pictures as for `simulate`, or scenes. Their times `t_us` are whole microseconds, the first of them
-    0. With `upsample`, interpolated frames are added so that nothing moves by more than about one pixel a step. The
-    same arguments give the same events on any number of threads. ValueError for times that do not fit the frames, and
-    as `simulate`.
+    Frames are RGB pictures as for `simulate`, or scenes, at whole microseconds `t_us` from 0. With `upsample`,
+    interpolated frames are added so that nothing moves by more than about one pixel a step. The number of threads
+    changes no event. ValueError for times that do not fit the frames, and as `simulate`.
 
     >>> import torch
     >>> from polarnet.clips import simulate_video
@@ -145,12 +139,9 @@ def stokes_frames(
     """Frames with their times; ValueError if there are more or fewer times than frames."""
     for number, (time_us, frame) in enumerate(itertools.zip_longest(t_us, frames)):
         if time_us is None or frame is None:
-            raise ValueError(
-                f"expected one time for each frame, got {'more frames' if time_us is None else 'more times'} than "
-                f"{number}; give as many times as frames"
-            )
+            more = "more frames" if time_us is None else "more times"
+            raise ValueError(f"expected one time a frame, got {more} than {number}; give as many times as frames")
         if isinstance(frame, PolarizationScene):
             check_scene(frame)
-            yield StokesFrame(int(time_us), frame.stokes)
-        else:
-            yield StokesFrame(int(time_us), scene_from_rgb(frame).stokes)
+        scene = frame if isinstance(frame, PolarizationScene) else scene_from_rgb(frame)
+        yield StokesFrame(int(time_us), scene.stokes)

@@ -169,7 +169,7 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes:
-    from polarnet.reports.curves import parallel_coordinates  # every stage imports this module, and only a sweep draws
+    from polarnet.reports.charts import parallel_coordinates  # every stage imports this module, and only a sweep draws
     from polarnet.reports.maps import png
 
     return png(parallel_coordinates(values, scores, "validation MSE"))

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
-    from polarnet.reports.look import plot_events as plot_events
-    from polarnet.reports.look import plot_frame as plot_frame
-    from polarnet.reports.look import plot_prediction as plot_prediction
+    from polarnet.reports.preview import plot_events as plot_events
+    from polarnet.reports.preview import plot_frame as plot_frame
+    from polarnet.reports.preview import plot_prediction as plot_prediction
     from polarnet.reports.preview import write_true_video as write_true_video
     from polarnet.reports.videos import VideoWriter as VideoWriter
 

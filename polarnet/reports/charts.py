@@ -1,53 +1,29 @@
-"""Charts of the pages, drawn in the page's own colours (`polarnet.reports.html.svg`)."""
+"""Charts of the pages in the pages' own colours (`polarnet.reports.figures.svg`), and figures of studies and sweeps."""
 
-import functools
+import contextlib
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ParamSpec
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from polarnet.reports.artefacts import BudgetPoint, History, Results
-from polarnet.reports.figures import PAGE, chart_style
-from polarnet.reports.legend import Legend, in_order, with_structure
+from polarnet.reports.artefacts import History, Results
+from polarnet.reports.figures import LIGHT, PAGE, styled
+from polarnet.reports.legend import GENERAL, Legend, in_order, with_structure
 from polarnet.reports.tables import Column
 
-TERMS = {
-    "total": "total (weighted)",
-    "mse": "MSE",
-    "mae": "MAE",
-    "ssim_loss": "1 - SSIM",
-    "lpips": "LPIPS",
-    "stokes": "S1/S0, S2/S0",
-    "relative_mse": "MSE (relative)",
-    "relative_stokes": "S1/S0, S2/S0 (relative)",
-}
-"""Legend labels of loss terms."""
-BRANCHES = {"intensity": "intensity", "aolp": "AoLP", "dolp": "DoLP"}
-"""Outputs of a network with one loss per output; their terms are named BRANCH_TERM."""
 WIDTH, HEIGHT = 4.8, 2.8  # inches
 ROW_HEIGHT, LABEL_LETTERS = 0.26, 28  # of a method beside a chart: inches, and letters in a line of its label
-
-Arguments = ParamSpec("Arguments")
-
-
-def _charted(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-    """Draw in the style of the pages."""
-
-    @functools.wraps(draw)
-    def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
-        with matplotlib.rc_context(chart_style(PAGE)):
-            return draw(*args, **kwargs)
-
-    return drawn
+PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
 
 
-def _axes(height: float = HEIGHT, width: float = WIDTH) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor="none")
+def _axes(height: float = HEIGHT) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained", facecolor="none")
     return figure, figure.subplots()
 
 
@@ -63,7 +39,7 @@ def _method_axes(labels: Sequence[str]) -> tuple[Figure, Axes]:
 
 def _above(figure: Figure) -> None:
     """Put the legend above the axes."""
-    figure.legend(loc="outside upper left", ncols=2, frameon=False, fontsize=7)
+    figure.legend(loc="outside upper left", ncols=2)
 
 
 def _logarithmic(axes: Axes, which: str) -> None:
@@ -85,20 +61,20 @@ def _diagonal(axes: Axes, values: Iterable[float]) -> None:
     axes.set(xlim=ends, ylim=ends)
 
 
-@_charted
+@styled(PAGE)
 def score_chart(metrics: Mapping[str, Mapping[str, Any]], key: str, column: Column, legend: Legend) -> Figure:
     """A score of each method that has it, with its 95 % interval."""
     methods = [method for method in in_order(metrics) if metrics[method].get(key) is not None]
     figure, axes = _method_axes([legend.label(method) for method in methods])
     for place, method in enumerate(methods):
-        axes.plot(metrics[method].get(f"{key}_ci", []) or [], [place] * len(metrics[method].get(f"{key}_ci") or []),
-                  color=legend.colour(method))  # fmt: skip
+        interval = metrics[method].get(f"{key}_ci") or []
+        axes.plot(interval, [place] * len(interval), color=legend.colour(method))
         axes.plot(metrics[method][key], place, "o", color=legend.colour(method), markersize=5)
     axes.set_xlabel(column.heading)
     return figure
 
 
-@_charted
+@styled(PAGE)
 def scatter_chart(means: Mapping[str, Mapping[str, float]], rival: str, legend: Legend) -> Figure:
     """MSE of ours against that of another method, a dot a scene; below the line ours is better.
 
@@ -108,55 +84,29 @@ def scatter_chart(means: Mapping[str, Mapping[str, float]], rival: str, legend: 
     figure, axes = _axes()
     _diagonal(axes, [means[method][scene] for method in ("ours", rival) for scene in scenes])
     x, y = ([means[method][scene] for scene in scenes] for method in (rival, "ours"))
-    axes.plot(x, y, "o", color=legend.colour("ours"), markersize=5)
+    axes.plot(x, y, "o", color=legend.colour("ours"), markersize=4)
     axes.set(xlabel=f"MSE of {legend.label(rival)}", ylabel="MSE of ours")
     return figure
 
 
-@_charted
-def spread_chart(means: Mapping[str, Mapping[str, float]], legend: Legend) -> Figure:
-    """MSE of every scene and method; the stroke is the median."""
-    methods = in_order(means)
-    figure, axes = _method_axes([legend.label(method) for method in methods])
-    for place, method in enumerate(methods):
-        values = [mse for mse in means[method].values() if mse > 0]
-        axes.plot(values, [place] * len(values), "o", color=legend.colour(method), markersize=4, alpha=0.6)
-        axes.plot([np.median(values)] if values else [], [place] if values else [], "|", color=PAGE.text, markersize=12)
-    _logarithmic(axes, "x")
-    axes.set_xlabel("MSE of a scene")
-    return figure
-
-
-@_charted
-def loss_chart(history: History) -> Figure:
-    """Loss terms over epochs from 1, logarithmic if all are positive."""
-    figure, axes = _axes()
+@styled(PAGE)
+def training_chart(history: History, output: str) -> Figure:
+    """Loss terms, logarithmic if all are positive, and validation PSNR over epochs from 1."""
+    figure = Figure(figsize=(WIDTH, 1.7 * HEIGHT), layout="constrained", facecolor="none")
+    loss, psnr = figure.subplots(2, sharex=True, height_ratios=(3, 2))
     for term, values in history.loss.items():
-        axes.plot(range(1, len(values) + 1), values, "o-", markersize=3, label=term_label(term))
+        loss.plot(range(1, len(values) + 1), values, "o-", label=term.replace("_", " "))
     if all(value > 0 for values in history.loss.values() for value in values):
-        _logarithmic(axes, "y")
-    axes.set(xlabel="epoch", ylabel="training loss")
+        _logarithmic(loss, "y")
+    validation = history.validation["psnr"]
+    psnr.plot(range(1, len(validation) + 1), validation, "o-")
+    loss.set_ylabel("training loss")
+    psnr.set(xlabel="epoch", ylabel=f"validation PSNR\nof {output}, dB")
     _above(figure)
     return figure
 
 
-@_charted
-def psnr_chart(history: History, output: str) -> Figure:
-    """Validation PSNR over epochs from 1."""
-    figure, axes = _axes()
-    psnr = history.validation["psnr"]
-    axes.plot(range(1, len(psnr) + 1), psnr, "o-", markersize=3)
-    axes.set(xlabel="epoch", ylabel=f"validation PSNR of {output}, dB")
-    return figure
-
-
-def term_label(name: str) -> str:
-    """Legend label of a loss term."""
-    branch, _, term = name.partition("_")
-    return f"{BRANCHES[branch]}: {TERMS[term]}" if branch in BRANCHES and term in TERMS else TERMS.get(name, name)
-
-
-@_charted
+@styled(PAGE)
 def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], legend: Legend) -> Figure:
     """Measured against expected squared error by method; dots grow with the number of pixels."""
     figure, axes = _axes()
@@ -170,21 +120,7 @@ def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], leg
     return figure
 
 
-@_charted
-def budget_chart(points: Sequence[BudgetPoint], legend: Legend) -> Figure:
-    """Mean MSE against the events per pixel since the start of a sequence, a line a method."""
-    figure, axes = _axes(HEIGHT + 0.5)
-    for method in in_order(dict.fromkeys(point.method for point in points)):
-        own = [point for point in points if point.method == method and point.events_per_pixel > 0]
-        axes.plot([point.events_per_pixel for point in own], [point.mse for point in own], "o-", markersize=3,
-                  color=legend.colour(method), label=legend.label(method))  # fmt: skip
-    _logarithmic(axes, "x")
-    axes.set(xlabel="events per pixel since the start", ylabel="MSE")
-    _above(figure)
-    return figure
-
-
-@_charted
+@styled(PAGE)
 def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Figure:
     """Heat map: MSE of each method on each test set, divided by the best constant's; no tile without both."""
     methods = with_structure(dict.fromkeys(method for one in sets for method in one.metrics))
@@ -207,3 +143,67 @@ def _to_constant(one: Results, method: str) -> float:
     """MSE of a method on a set, divided by that of the best constant; not a number where either is unknown."""
     mse, constant = (one.metrics.get(row, {}).get("mse") for row in (method, "oracle_mean"))
     return mse / constant if mse and constant else float("nan")
+
+
+@styled(LIGHT)
+def event_budget_figure(results: Mapping[str, Any]) -> Figure:
+    """PSNR (dB) and correlation of DoLP against events per pixel since the start, and against window length.
+
+    `results` is the content of event_budget.json.
+    """
+    figure = Figure(figsize=(7.0, 5.0), layout="constrained", facecolor="none")
+    axes = figure.subplots(2, 2, sharey="row")
+    for row, (metric, label) in zip(axes, (("psnr", "PSNR, dB"), ("corr", "correlation")), strict=True):
+        for axis, study, x, scale in zip(
+            row, ("since_start", "window_length"), ("events_per_pixel", "window_us"), (1.0, 1e-3), strict=True
+        ):
+            for method in in_order(results[study]):
+                entries = results[study][method]
+                places = [scale * entry[x] for entry in entries]
+                colour, name = GENERAL.colour(method), GENERAL.label(method)
+                axis.plot(places, [entry[metric] for entry in entries], "o-", color=colour, label=name)
+            _logarithmic(axis, "x")
+        row[0].axvline(PAPER_EVENTS_PER_PIXEL, color=LIGHT.quiet, linewidth=0.9, linestyle="--")
+        row[0].set_ylabel(label)
+    for axis, title, x in zip(
+        axes.T, ("since the start (dashed: the paper's 1.04)", "by window length"), ("events per pixel", "window, ms"),
+        strict=True,
+    ):  # fmt: skip
+        axis[0].set_title(title, loc="left", fontsize=9)
+        axis[1].set_xlabel(x)
+    axes[0][0].legend()
+    return figure
+
+
+@styled(LIGHT)
+def parallel_coordinates(values: Mapping[str, Sequence[str]], scores: Sequence[float], score_label: str) -> Figure:
+    """One axis for each swept key and one for the score; the line of the lowest score is drawn last and thick.
+
+    `values` has a value for each point, by key. An axis spaces them evenly: numbers by size, words as they appear.
+    """
+    figure = Figure(figsize=(2.2 * (len(values) + 1), 3.6), layout="constrained", facecolor=LIGHT.face)
+    axes = figure.subplots()
+    colours, scaled = matplotlib.colormaps["viridis_r"], Normalize(min(scores), max(scores))
+    heights = [_height_of(column) for column in values.values()]
+    span = max(scores) - min(scores) or 1.0
+    for number in sorted(range(len(scores)), key=lambda number: -scores[number]):
+        levels = [height[column[number]] for height, column in zip(heights, values.values(), strict=True)]
+        levels.append((scores[number] - min(scores)) / span)
+        best = number == int(np.argmin(scores))
+        axes.plot(levels, color=colours(scaled(scores[number])), linewidth=3.0 if best else 1.3)
+    heights.append({f"{min(scores):.4f}": 0.0, f"{max(scores):.4f}": 1.0})
+    for place, height in enumerate(heights):
+        for value, level in height.items():
+            axes.text(place + 0.04, level, value, fontsize=8, va="bottom", color=LIGHT.text)
+    axes.set_xticks(range(len(values) + 1), [*values, score_label], fontsize=8)
+    axes.set(yticks=[], xlim=(-0.2, len(values) + 0.5))
+    axes.grid(axis="x")
+    return figure
+
+
+def _height_of(column: Sequence[str]) -> dict[str, float]:
+    """Place of each value on its axis, from 0 to 1."""
+    distinct = list(dict.fromkeys(column))
+    with contextlib.suppress(ValueError):
+        distinct.sort(key=float)
+    return {value: place / max(len(distinct) - 1, 1) for place, value in enumerate(distinct)}

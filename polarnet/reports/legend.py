@@ -4,14 +4,13 @@ The networks behind `ours` and `E2V` depend on the weights.
 """
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from polarnet.methods import METHODS, ROWS
 from polarnet.methods.intensities import GAIN
 from polarnet.metrics.references import REFERENCES
 
-LABELS: Mapping[str, str] = MappingProxyType({name: row.label for name, row in ROWS.items()})
+LABELS: Mapping[str, str] = {name: row.label for name, row in ROWS.items()}
 """Default labels of the rows, in table order, for results that do not name the networks."""
 
 
@@ -23,23 +22,21 @@ class Network(NamedTuple):
     about: str
 
 
-POLARNET = Network(
-    "polarnet's network",
-    METHODS["ours"].colour,
-    "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of DoLP out. It "
-    "solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
-)
 RECONSTRUCTS = "a recurrent network from events to intensity, one polarizer at a time, then DoLP by the Stokes formula."
 NETWORKS = {
-    "polarnet": POLARNET,
-    **{
-        name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
-        for name in ("paper", "e2p", "cista_tc")
-    },
+    "polarnet": Network(
+        "polarnet's network",
+        METHODS["ours"].colour,
+        "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of DoLP "
+        "out. It solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
+    ),
     "e2vid": Network("E2VID", METHODS["e2vid_published"].colour, f"E2VID (Rebecq et al. 2019), {RECONSTRUCTS}"),
     "firenet": Network(
         "FireNet", METHODS["firenet_published"].colour, f"FireNet (Scheerlinck et al. 2020), {RECONSTRUCTS}"
     ),
+} | {
+    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
+    for name in ("paper", "e2p", "cista_tc")
 }
 """Networks by their name in a checkpoint."""
 
@@ -60,7 +57,7 @@ class Legend(NamedTuple):
     """Labels and colours of the rows of one benchmark, with and without solved gains."""
 
     labels: Mapping[str, str]
-    colours: Mapping[str, str]
+    colours: dict[str, str]
 
     def label(self, method: str) -> str:
         """The label of a row; an unknown row keeps its key."""
@@ -88,18 +85,15 @@ def with_structure(rows: Iterable[str]) -> list[str]:
 
 def legend_of(weights: Mapping[str, Mapping[str, Any]]) -> Legend:
     """The legend of a benchmark, from details.json's `weights`, which name the network behind each row."""
-    networks = {row: file["network"] for row, file in weights.items()}
-    labels, colours = dict(GENERAL.labels), dict(GENERAL.colours)
-    colours |= {row: NETWORKS[network].colour for row, network in networks.items() if network in NETWORKS}
-    for row in NAMED_BY_NETWORK:
-        network = NETWORKS.get(networks.get(row, ""))
-        if network and LABELS[row] != network.label:
-            for method in (row, row + GAIN):
-                if method in LABELS:
-                    labels[method] = LABELS[method].replace(LABELS[row], f"{LABELS[row]}: {network.label}")
-    if networks.get("paper", "paper") != "paper":
-        labels["paper"] = f"second network: {network_label(networks['paper'])}"
-    return Legend(labels, colours)
+    networks = {row: file["network"] for row, file in weights.items() if file["network"] in NETWORKS}
+    labels = dict(LABELS)
+    for row, network in networks.items():
+        if row in NAMED_BY_NETWORK and LABELS[row] != NETWORKS[network].label:
+            own = "second network" if row == "paper" else LABELS[row]
+            labels[row] = f"{own}: {NETWORKS[network].label}"
+            if row + GAIN in LABELS:
+                labels[row + GAIN] = LABELS[row + GAIN].replace(LABELS[row], labels[row])
+    return Legend(labels, GENERAL.colours | {row: NETWORKS[network].colour for row, network in networks.items()})
 
 
 def network_label(network: str) -> str:
@@ -113,7 +107,7 @@ def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -
     entries = [
         (legend.label(row), _about(row, weights.get(row)))
         for row in dict.fromkeys(method.removesuffix(GAIN) for method in rows)
-        if row in weights or (row in ROWS and ROWS[row].about and not _needs_weights(row))
+        if row in weights or (row in ROWS and ROWS[row].about and (row not in METHODS or METHODS[row].weights is None))
     ]
     return entries + ([("gains solved", GAINS)] if any(method.endswith(GAIN) for method in rows) else [])
 
@@ -138,7 +132,3 @@ def _about(row: str, file: Mapping[str, Any] | None) -> str:
         about = network.about if row in NETWORKS else f"{about} {network.about}".lstrip()
     origin = "trained by polarnet" if file["file"].endswith(".safetensors") else "as its authors published them"
     return f"{about} Weights: {file['file']}, {origin}.".lstrip()
-
-
-def _needs_weights(row: str) -> bool:
-    return row in METHODS and METHODS[row].weights is not None

@@ -1,6 +1,5 @@
 """Pictures of tensors (events, DoLP, polarization as hue, saturation and value), and picture files of them."""
 
-import base64
 import io
 import math
 from pathlib import Path
@@ -12,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.colors import Colormap, LinearSegmentedColormap, hsv_to_rgb
+from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -88,21 +87,6 @@ def paper_map(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8[n
     return polarization_hsv(dolp, torch.ones_like(dolp), aolp)
 
 
-def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
-    """The legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1. RGBA, transparent outside.
-
-    Opposite points have the same colour, since both directions of a line are one angle of polarization. Angles count
-    anticlockwise from the right, as on paper; the first row is the top.
-    """
-    axis = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(axis, -axis)
-    radius = np.hypot(x, y)
-    hue = np.arctan2(y, x) / math.pi % 1.0
-    rgb = hsv_to_rgb(np.stack([hue, radius.clip(0, 1), np.ones_like(hue)], axis=-1))
-    edge = ((1 - radius) * size / 2).clip(0, 1)  # soft rim, one pixel wide
-    return np.concatenate([_bytes(rgb), _bytes(edge)[..., None]], axis=-1)
-
-
 def png(figure: Figure) -> bytes:
     """Encode a figure as a PNG without a date or software name: the same figure gives the same bytes."""
     buffer = io.BytesIO()
@@ -123,22 +107,8 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 def encode_png(picture: UInt8[np.ndarray, "h w channels"]) -> bytes:
     """Encode RGB or RGBA bytes as a PNG without metadata: the same picture gives the same bytes."""
-    return _encoded(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-
-
-def encode_jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Encode RGB bytes as a small JPEG, for thumbnails of photographs."""
-    return _encoded(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
-
-
-def data_uri(content: bytes, kind: str) -> str:
-    """Encode a picture file's content as a data URI."""
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _encoded(kind: str, picture: UInt8[np.ndarray, "h w channels"], options: list[int]) -> bytes:
     order = [2, 1, 0, 3][: picture.shape[-1]]  # OpenCV writes BGR
-    done, data = cv2.imencode(kind, picture[..., order], options)
+    done, data = cv2.imencode(".png", picture[..., order], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     assert done, f"OpenCV could not encode a picture of {picture.shape}"
     return data.tobytes()
 

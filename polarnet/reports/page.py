@@ -5,25 +5,16 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from markupsafe import Markup
 from ruamel.yaml import YAML
 
 from polarnet.methods import METHODS, is_rotating
-from polarnet.reports.artefacts import Artefacts, History, ReportPaths, Results, read_artefacts, read_results
-from polarnet.reports.charts import (
-    budget_chart,
-    loss_chart,
-    psnr_chart,
-    reliability_chart,
-    scatter_chart,
-    score_chart,
-    sets_chart,
-    spread_chart,
-)
-from polarnet.reports.figures import comparison_figure
-from polarnet.reports.html import embedded_json, script, svg, template
+from polarnet.pictures.manifest import Manifest, read_manifest
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, read_results, training_history
+from polarnet.reports.charts import reliability_chart, scatter_chart, score_chart, sets_chart, training_chart
+from polarnet.reports.figures import svg
+from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
@@ -35,14 +26,14 @@ from polarnet.reports.legend import (
     network_label,
     with_structure,
 )
-from polarnet.reports.maps import data_uri, encode_jpeg, png
-from polarnet.reports.overview import overview_figure
-from polarnet.reports.paper import write_paper_files
-from polarnet.reports.player import Film, panel_film, player_data
+from polarnet.reports.maps import png
+from polarnet.reports.paper import comparison_figure, write_paper_files
+from polarnet.reports.player import panel_film, player_data
 from polarnet.reports.provenance import Run
 from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, Table, paper_table, score_table
-from polarnet.runtime.splits import SPLITS
+from polarnet.storage.scenes import SceneStore
 
+OURS = "ours"
 HEADINGS = {
     "mse": "MSE",
     "psnr": "PSNR, dB",
@@ -54,11 +45,12 @@ HEADINGS = {
 }
 """Columns of the first table; all others are one click away."""
 PAGE_COLUMNS = {key: replace(COLUMNS[key], label=heading) for key, heading in HEADINGS.items()}
-SCENES_AT_EACH_END = 3
+WORST_SCENES = 5
 MAX_FIGURE_PANELS = 4
+GENERATED = "dead_leaves"
 SOURCE_NAMES = {
     "photograph": "photographs",
-    "dead_leaves": "generated dead leaves",
+    GENERATED: "generated dead leaves",
     "folder": "of your own",
     "polarization": "of measured polarization",
 }
@@ -70,48 +62,28 @@ SET_ABOUT = {
 }
 
 
-class SceneScore(NamedTuple):
-    """A scene among the best or worst of a method."""
-
-    scene: str
-    mse: float
-    rival: str
-    """Label of the best other method there."""
-    rival_mse: float | None
-    film: str | None
-    """Name of the scene in the player; None if it is not there."""
-
-
 def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
-    """Write index.html and, beside it, overview.png, comparison.png and the folder paper; `baselines` were trained.
+    """Write index.html and, beside it, comparison.png and the folder paper; `baselines` were trained.
 
     The folder holds the paper's Table 2 and figures 9 and 10 (`polarnet.reports.paper`). The page needs no other file
     and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
-    artefacts = read_artefacts(paths, baselines)
-    results, legend = artefacts.results, legend_of(artefacts.results.details["weights"])
-    folder.mkdir(parents=True, exist_ok=True)
-    overview = None
-    if artefacts.overview is not None:
-        overview = png(overview_figure(artefacts.overview))
-        (folder / "overview.png").write_bytes(overview)
-    sets = [results, *artefacts.sets]
-    write_paper_files(folder / "paper", sets, legend)
-    budget = [point for point in artefacts.budget if not is_rotating(point.method)]  # that camera has other events
-    charts = {"budget": svg(budget_chart(budget, legend))}
-    if len(sets) > 1:
-        charts["sets"] = svg(sets_chart(sets, SET_TITLES, legend))
-    context = {
+    manifest, results = read_manifest(paths.images), read_results(paths.simulated)
+    generated = {entry.name for entry in manifest.pictures if entry.source == GENERATED}
+    scene_of = SceneStore.open(paths.scenes).scene_of
+    panels = sorted(results.panels, key=lambda p: (scene_of[p.sequence] in generated, -float(p.truth.dolp.std())))
+    others = [read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED]
+    sets = [results._replace(panels=panels), *others]
+    write_paper_files(folder / "paper", sets, legend_of(results.details["weights"]))
+    content = {
         "title": "polarnet report",
         "command": run.command,
         "facts": run.facts,
         "parameters": _as_yaml(run.parameters),
-        "overview": None if overview is None else data_uri(overview, "png"),
-        "sets": [_set(one, legend) for one in artefacts.sets],
-        "trainings": _trainings(artefacts),
-        "data": _data(artefacts),
+        "trainings": [_training(paths.train, name) for name in (OURS, *baselines)],
+        "pictures": _pictures(manifest),
     }
-    return _write_page(folder, sets, legend, context, charts)
+    return _write_page(folder, sets, content)
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
@@ -120,57 +92,66 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
     """
     results = read_results(folder)
-    legend, weights = legend_of(results.details["weights"]), results.details["weights"]
-    facts = {legend.label(row): f"{file['file']} (sha256 {file['sha256'][:16]})" for row, file in weights.items()}
-    context = {"title": f"polarnet benchmark: {title}", "command": command, "notes": notes, "facts": facts}
-    return _write_page(folder, [results], legend, context, {})
+    weights = results.details["weights"]
+    facts = {
+        legend_of(weights).label(row): f"{file['file']} (sha256 {file['sha256'][:16]})" for row, file in weights.items()
+    }
+    content = {"title": f"polarnet benchmark: {title}", "command": command, "notes": notes, "facts": facts}
+    return _write_page(folder, [results], content)
 
 
-def _write_page(
-    folder: Path, sets: Sequence[Results], legend: Legend, context: Mapping[str, Any], charts: Mapping[str, Markup]
-) -> Path:
+def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any]) -> Path:
     """Fill the template into index.html, and write the panels as comparison.png; no such file without panels."""
-    results = sets[0]
+    results, *others = sets
+    metrics, details = results.metrics, results.details
+    legend, means = legend_of(details["weights"]), details["scene_means"].get("mse", {})
+    method = OURS if OURS in metrics else _best_method(metrics)
+    folder.mkdir(parents=True, exist_ok=True)
     if results.panels:
         figure = comparison_figure(results.panels[:MAX_FIGURE_PANELS], results.panels[0].predictions, legend)
         (folder / "comparison.png").write_bytes(png(figure))
-    films = [
-        panel_film(panel, legend, "" if one is results else SET_TITLES.get(one.name, one.name))
-        for one in sets
-        for panel in one.panels
-    ]
-    values = _results_context(results, legend, films) | dict(context)
-    values |= {
-        "charts": {**_result_charts(results, legend), **charts},
-        "player_json": embedded_json(player_data(films)) if films else None,
-        "script": script,
-    }
-    path = folder / "index.html"
-    path.write_text(template("page.html.jinja").render(values), encoding="utf-8")
-    return path
-
-
-def _results_context(results: Results, legend: Legend, films: Sequence[Film]) -> dict[str, Any]:
-    """Template values of the results on the test set; empty for the parts that only a pipeline's report has."""
-    metrics, details = results.metrics, results.details
-    return {
+    films = [panel_film(panel, legend) for panel in results.panels]
+    films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
+    values = {
+        "notes": [],
+        "parameters": None,
+        "trainings": [],
+        "pictures": None,
         "details": details,
         "verdict": verdict(metrics, details, legend),
         "scores": _page_table(results, legend),
         "all_scores": score_table(metrics, labels=legend.labels),
         "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
         "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
-        "extremes": extremes(results, legend, {film.name for film in films}),
-        "ours": _spoken("ours" if "ours" in metrics else _best_method(metrics), legend),
+        "worst": _worst_scenes(means.get(method, {}), [film.name for film in films]),
+        "ours": _spoken(method, legend),
         "glossary": glossary(metrics, details["weights"]),
         "lpips_about": lpips_about(details["lpips"]),
         "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
-        "notes": [],
-        "parameters": None,
-        "overview": None,
-        "sets": [],
-        "trainings": [],
-        "data": None,
+        "sets": [_set(one, legend) for one in others],
+        "charts": _charts(sets, legend),
+        "player_json": embedded_json(player_data(films)) if films else None,
+        "script": script,
+    }
+    path = folder / "index.html"
+    path.write_text(template("page.html.jinja").render(values | dict(content)), encoding="utf-8")
+    return path
+
+
+def _charts(sets: Sequence[Results], legend: Legend) -> dict[str, Any]:
+    """Charts of the results on a test set; None where there is nothing to show."""
+    metrics, details = sets[0].metrics, sets[0].details
+    means = details["scene_means"].get("mse", {})
+    scored = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
+    rivals = [row for row in with_structure(means) if row != OURS] if OURS in means else []
+    rival = min(rivals, key=lambda row: metrics[row]["mse"], default=None)
+    groups = {row: entry["curve"] for row, entry in details.get("reliability", {}).items()}
+    curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
+    return {
+        "scores": [svg(score_chart(metrics, key, PAGE_COLUMNS[key], legend)) for key in scored],
+        "scatter": None if rival is None else svg(scatter_chart(means, rival, legend)),
+        "reliability": svg(reliability_chart(curves, legend)) if curves else None,
+        "sets": svg(sets_chart(sets, SET_TITLES, legend)) if len(sets) > 1 else None,
     }
 
 
@@ -178,25 +159,9 @@ def _page_table(results: Results, legend: Legend) -> Table:
     return score_table(results.metrics, PAGE_COLUMNS, legend.labels, results.details["warmup_windows"])
 
 
-def _result_charts(results: Results, legend: Legend) -> dict[str, Any]:
-    """Charts of the results on a test set: a list or None where there may be several or none."""
-    means, metrics = results.details["scene_means"].get("mse", {}), results.metrics
-    shown = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
-    rivals = sorted((row for row in with_structure(means) if row != "ours"), key=lambda row: metrics[row]["mse"])
-    groups = {row: entry["curve"] for row, entry in results.details.get("reliability", {}).items()}
-    curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
-    return {
-        "scores": [svg(score_chart(metrics, key, PAGE_COLUMNS[key], legend)) for key in shown],
-        "spread": svg(spread_chart(means, legend)),
-        "scatter": [svg(scatter_chart(means, row, legend)) for row in rivals] if "ours" in means else [],
-        "reliability": svg(reliability_chart(curves, legend)) if curves else None,
-        "sets": None,
-    }
-
-
 def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
     """One sentence: the error of ours, beside the best other method and the best constant."""
-    method = "ours" if "ours" in metrics else _best_method(metrics)
+    method = OURS if OURS in metrics else _best_method(metrics)
     mse, scenes = metrics[method]["mse"], len(details["scenes"])
     plural = "" if scenes == 1 else "s"
     start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
@@ -226,20 +191,10 @@ def _best_method(metrics: Scores) -> str:
     return min(with_structure(metrics) or in_order(metrics), key=lambda row: metrics[row]["mse"])
 
 
-def extremes(results: Results, legend: Legend, films: set[str]) -> list[tuple[str, list[SceneScore]]]:
-    """The worst and the best scenes of ours (without it: of the best method), by MSE."""
-    means = results.details["scene_means"].get("mse", {})
-    method = "ours" if "ours" in means else _best_method(results.metrics)
-    others = [row for row in with_structure(means) if row != method and not is_rotating(row)]
-    sequences = {scene: name for name in films for scene in means[method] if name.startswith(scene)}
-    scores = []
-    for scene, mse in sorted(means[method].items(), key=lambda item: -item[1]):
-        known = {row: means[row][scene] for row in others if scene in means[row]}
-        best = min(known, key=lambda row: known[row], default=None)
-        label = "" if best is None else legend.label(best)
-        scores.append(SceneScore(scene, mse, label, known.get(best or ""), sequences.get(scene)))
-    count = min(SCENES_AT_EACH_END, (len(scores) + 1) // 2)
-    return [("Worst scenes", scores[:count]), ("Best scenes", scores[count:][-SCENES_AT_EACH_END:][::-1])]
+def _worst_scenes(means: Mapping[str, float], films: Sequence[str]) -> list[tuple[str, float, str | None]]:
+    """The scenes with the largest MSE, and the film of each in the player; None if it is not there."""
+    worst = sorted(means.items(), key=lambda item: -item[1])[:WORST_SCENES]
+    return [(scene, mse, next((film for film in films if film.startswith(scene)), None)) for scene, mse in worst]
 
 
 def _set(one: Results, legend: Legend) -> dict[str, Any]:
@@ -253,45 +208,33 @@ def _set(one: Results, legend: Legend) -> dict[str, Any]:
     }
 
 
-def _data(artefacts: Artefacts) -> dict[str, Any]:
-    """Template values of the pictures: counts, thumbnails by split, licences."""
-    manifest = artefacts.manifest
+def _pictures(manifest: Manifest) -> dict[str, Any]:
+    """Template values of the pictures: numbers by source and split, licences, skipped files."""
     sources = Counter(entry.source for entry in manifest.pictures)
     return {
         "manifest": manifest,
         "sources": ", ".join(f"{count} {SOURCE_NAMES.get(source, source)}" for source, count in sources.items()),
-        "thumbnails": {
-            split: {name: data_uri(encode_jpeg(small), "jpeg") for name, small in artefacts.thumbnails[split].items()}
-            for split in SPLITS
-        },
-        "skipped": [(one.file, one.reason) for one in manifest.skipped],
         "licences": [
             (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")
             for one in manifest.pictures
         ],
+        "skipped": [(one.file, one.reason) for one in manifest.skipped],
     }
 
 
-def _trainings(artefacts: Artefacts) -> list[dict[str, Any]]:
-    """Template values of each training."""
-    histories = [("ours: ", artefacts.ours, "DoLP")]
-    histories += [_baseline(name, history) for name, history in artefacts.baselines.items()]
-    return [
-        {
-            "title": f"{row}{network_label(history.network)}, events to {output}",
-            "charts": [svg(loss_chart(history)), svg(psnr_chart(history, output))],
-            "epochs": len(history.validation["psnr"]),
-            "best_epoch": history.best_epoch + 1,
-            "best_psnr": history.validation["psnr"][history.best_epoch],
-        }
-        for row, history, output in histories
-    ]
-
-
-def _baseline(name: str, history: History) -> tuple[str, History, str]:
-    """Row (if its label does not name the network), training and output of a trained baseline."""
+def _training(folder: Path, name: str) -> dict[str, Any]:
+    """Template values of a training."""
+    history = training_history(folder / name)
     row = f"{LABELS[name]}: " if name in NAMED_BY_NETWORK else ""
-    return row, history, "intensity" if METHODS[name].reconstructs else "polarization"
+    output = "DoLP" if name == OURS else "intensity" if METHODS[name].reconstructs else "polarization"
+    psnr = history.validation["psnr"]
+    return {
+        "title": f"{row}{network_label(history.network)}, events to {output}",
+        "chart": svg(training_chart(history, output)),
+        "epochs": len(psnr),
+        "best_epoch": history.best_epoch + 1,
+        "best_psnr": psnr[history.best_epoch],
+    }
 
 
 def _as_yaml(values: Mapping[str, Any]) -> str:

@@ -1,19 +1,21 @@
 """The paper's Table 2 and its figures 9, 10 and 11 from a run, as files that a text can include."""
 
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from polarnet.metrics.similarity import mse, psnr
 from polarnet.reports.artefacts import Results
-from polarnet.reports.figures import LIGHT, chart_style, comparison_figure, show_picture, tile_grid
-from polarnet.reports.legend import Legend
+from polarnet.reports.figures import LIGHT, show_picture, styled, tile_grid
+from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import dolp_image, event_full_scale, event_image, write_figure
-from polarnet.reports.tables import COLUMNS, Row, Scores, Table, as_csv, as_latex, as_markdown, score_table
+from polarnet.reports.tables import COLUMNS, Row, Scores, Table, as_latex, as_markdown, score_table
+from polarnet.storage.panels import Panel
 
 METHODS = ("cf", "e2v", "e2vid_published", "paper", "ours")
 """Rows of Table 2 and columns of figures 9 and 10, if they were run; the paper has CF, E2V and its network."""
@@ -21,10 +23,11 @@ METRICS = ("mse", "psnr", "ssim", "lpips")
 EXPERIMENTS = {"recordings": "Real", "simulated": "Simulated"}
 """Heading of each half of Table 2, by test set."""
 FIGURES = {"recordings": "figure_9", "simulated": "figure_10"}
+HEADING_LETTERS, NAME_LETTERS = 19, 18  # in a line above and beside a picture
 
 
 def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) -> None:
-    """Write figures 9 and 10 for the test sets with panels, and Table 2 (.md, .csv, .tex) if both sets were scored."""
+    """Write figures 9 and 10 for the test sets with panels, and Table 2 (.md, .tex) if both sets were scored."""
     sets = {one.name: one for one in results if one.name in EXPERIMENTS}
     for name, one in sets.items():
         if one.panels:
@@ -33,11 +36,9 @@ def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) 
     if set(sets) == set(EXPERIMENTS) and set(METHODS).intersection(*(one.metrics for one in sets.values())):
         warmup_windows = sets["simulated"].details["warmup_windows"]
         table = table_2(sets["recordings"].metrics, sets["simulated"].metrics, legend, warmup_windows)
-        groups = tuple(EXPERIMENTS.values())
         folder.mkdir(parents=True, exist_ok=True)
-        for kind, text in (
-            ("md", as_markdown(table, groups)), ("csv", as_csv(table, groups)), ("tex", as_latex(table, groups))
-        ):  # fmt: skip
+        for kind, written in (("md", as_markdown), ("tex", as_latex)):
+            text = written(table, tuple(EXPERIMENTS.values()))
             (folder / f"table_2.{kind}").write_text(text + "\n", encoding="utf-8")
 
 
@@ -52,9 +53,38 @@ def table_2(real: Scores, simulated: Scores, legend: Legend, warmup_windows: int
         )
         for one in (real, simulated)
     )  # fmt: skip
-    pairs = zip(left.rows, right.rows, strict=True)
-    joined = tuple(Row(a.method, a.label, a.cells + b.cells) for a, b in pairs)
-    return Table(left.headings + right.headings, joined, left.notes)
+    joined = [Row(a.method, a.label, a.cells + b.cells) for a, b in zip(left.rows, right.rows, strict=True)]
+    return Table(left.headings + right.headings, tuple(joined), left.notes)
+
+
+@styled(LIGHT)
+def comparison_figure(panels: Sequence[Panel], methods: Iterable[str], legend: Legend = GENERAL) -> Figure:
+    """Draw panels like the paper's Fig. 9 and 10: a row each, with events, truth and the DoLP of `methods`.
+
+    MSE and PSNR stand below each method; methods of one constant value are left out.
+    """
+    methods = with_structure(methods)
+    headings = ["events, 0°", "true DoLP", *(textwrap.fill(legend.label(one), HEADING_LETTERS) for one in methods)]
+    lines = max(1 + heading.count("\n") for heading in headings)
+    figure, grid = tile_grid(len(panels), len(headings), panels[0].s0.shape, heading_lines=lines)
+    for panel, row in zip(panels, grid, strict=True):
+        tiles = [(event_image(panel.events[0], event_full_scale(panel.events)), ""), (dolp_image(panel.truth.dolp), "")]
+        shown = [panel.predictions[method].dolp for method in methods]
+        tiles += [(dolp_image(dolp), score_line(dolp, panel.truth.dolp)) for dolp in shown]
+        for axes, (picture, below) in zip(row, tiles, strict=True):
+            show_picture(axes, picture, LIGHT)
+            axes.set_xlabel(below, fontsize=6, labelpad=2.5)
+        name = panel.sequence
+        row[0].set_ylabel(name if len(name) <= NAME_LETTERS else name[: NAME_LETTERS - 1] + "…", fontsize=6)
+    for axes, heading in zip(grid[0], headings, strict=True):
+        axes.set_title(heading, fontsize=8, pad=4)
+    return figure
+
+
+def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> str:
+    """MSE and PSNR of one frame, as the text below its picture."""
+    error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))
+    return f"{error:.4f} · {ratio:.2f} dB"
 
 
 class Moment(NamedTuple):
@@ -70,18 +100,15 @@ class Moment(NamedTuple):
     truth: Float[Tensor, "h w"]
 
 
+@styled(LIGHT)
 def figure_11(moments: Sequence[Moment]) -> Figure:
     """Draw event tensors, the DoLP recovered from them and the true DoLP, with t and n above each column."""
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, bar_row=1)
-        for k, moment in enumerate(moments):
-            tensor = event_image(moment.tensor, event_full_scale(moment.tensor))
-            for axes, picture in zip(
-                grid[:, k], (tensor, dolp_image(moment.recovered), dolp_image(moment.truth)), strict=True
-            ):
-                show_picture(axes, picture, LIGHT)
-            label = f"t = {moment.t_us / 1000:.1f} ms, n = {moment.events:,}"
-            grid[0, k].set_title(label, color=LIGHT.text, fontsize=6.5, pad=3)
-        for axes, name in zip(grid[:, 0], ("event tensor", "recovered", "truth"), strict=True):
-            axes.set_ylabel(name, color=LIGHT.quiet, fontsize=6.5)
+    figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, bar_row=1)
+    for column, moment in zip(grid.T, moments, strict=True):
+        tensor = event_image(moment.tensor, event_full_scale(moment.tensor))
+        for axes, picture in zip(column, (tensor, dolp_image(moment.recovered), dolp_image(moment.truth)), strict=True):
+            show_picture(axes, picture, LIGHT)
+        column[0].set_title(f"t = {moment.t_us / 1000:.1f} ms, n = {moment.events:,}", fontsize=6.5, pad=3)
+    for axes, name in zip(grid[:, 0], ("event tensor", "recovered", "truth"), strict=True):
+        axes.set_ylabel(name, fontsize=6.5)
     return figure

@@ -1,10 +1,9 @@
-// Plays the films of a page: colours the grey strips, shares time, zoom and cursor among pictures, wipes between two.
+// Plays the films of a page: colours the grey strips, shares time, zoom and cursor among pictures.
 "use strict";
 
 const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP", paper: "AoLP and DoLP (Fig. 3)" };
 const FRAMES_PER_SECOND = 6;
 const FULL_ERROR = 0.5; // DoLP at the end of the colours
-const PANE_WIDTH = 220; // pixels of the page that a pane needs, with its gap
 
 /** Grey values of a strip: a byte for each pixel of each frame. */
 async function strip(source, width) {
@@ -63,18 +62,9 @@ class Player {
     on("quantity", "change", () => this.arrange());
     on("play", "click", () => this.play(!this.timer));
     on("zoom", "input", (event) => this.look({ zoom: Number(event.target.value) }));
-    for (const role of ["left", "right", "divide"]) on(role, "input", () => this.wipe());
     const panes = this.find("panes");
     panes.addEventListener("pointermove", (event) => this.point(event));
     panes.addEventListener("keydown", (event) => this.step(event));
-    panes.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
-    new ResizeObserver(() => this.fit()).observe(panes);
-    this.find("wiped").addEventListener("pointermove", (event) => {
-      if (!event.buttons && event.pointerType === "mouse") return;
-      const box = event.currentTarget.getBoundingClientRect();
-      this.find("divide").value = 100 * (event.clientX - box.left) / box.width;
-      this.wipe();
-    });
   }
 
   async show(number) {
@@ -100,9 +90,6 @@ class Player {
     this.kinds = of_methods;
     option(this.find("quantity"), of_methods.map((kind) => TITLES[kind]), Math.max(0, of_methods.indexOf(before)));
     this.find("quantity").parentElement.hidden = of_methods.length < 2;
-    const stored = maps.filter((map) => map.error).map((map) => map.error);
-    const mean = stored.reduce((sum, [one]) => sum + one, 0) / stored.length, most = Math.max(...stored.map((one) => one[1]));
-    this.find("accuracy").textContent = stored.length ? `The pictures are compressed: DoLP at the cursor is off by ${mean.toFixed(3)} on average, by ${most.toFixed(2)} at most.` : "";
     const time = this.find("time");
     time.max = scene.ms.length - 1;
     time.value = Math.min(time.value, time.max);
@@ -134,54 +121,25 @@ class Player {
       return { map, figure, value, canvas, title: titled(map) };
     });
     this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
-    this.fit();
-    const names = this.panes.map((pane) => pane.title);
-    const truth = this.shown.findIndex((map) => map.source === "truth" && map.kind === quantity);
-    const first = this.shown.findIndex((map) => map.source !== "truth" && map.kind === quantity);
-    option(this.find("left"), names, Math.max(0, truth));
-    option(this.find("right"), names, first < 0 ? names.length - 1 : first);
-    this.find("wipe").hidden = names.length < 2;
     this.legends();
     this.draw();
   }
 
-  /** Spread the panes over as few rows as have room for them, about equally many in each. */
-  fit() {
-    if (!this.panes) return; // the first scene is still being decoded
-    const panes = this.find("panes");
-    const most = Math.max(2, Math.floor(panes.clientWidth / PANE_WIDTH));
-    const rows = Math.ceil(this.panes.length / most);
-    panes.style.setProperty("--columns", Math.ceil(this.panes.length / rows));
-  }
-
+  /** The colours of each quantity between its ends. */
   legends() {
-    const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => kind !== "s0");
-    const ends = { events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", "1"], error: ["error 0", `${FULL_ERROR}`] };
+    const ends = {
+      events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", "1"], error: ["error 0", `${FULL_ERROR}`],
+      aolp: ["AoLP 0° (to the right)", "180°"], paper: ["brightness: DoLP; hue: AoLP 0° (to the right)", "180°"],
+    };
+    const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => ends[kind]);
     this.find("legend").replaceChildren(...kinds.map((kind) => {
-      const entry = document.createElement("span");
-      const canvas = document.createElement("canvas");
-      const angles = kind === "paper" ? "hue: AoLP, brightness: DoLP; " : "";
-      entry.append(...(["aolp", "paper"].includes(kind) ? ["AoLP ", canvas, ` ${angles}0° lies to the right, 90° up`] : [ends[kind][0], canvas, ends[kind][1]]));
-      canvas.setAttribute("aria-hidden", "true");
-      ["aolp", "paper"].includes(kind) ? this.wheel_legend(canvas, kind) : this.bar(canvas, kind);
+      const entry = document.createElement("span"), bar = document.createElement("canvas");
+      Object.assign(bar, { width: 128, height: 1, className: "bar" });
+      bar.setAttribute("aria-hidden", "true");
+      this.paint(bar, kind, Uint16Array.from({ length: 128 }, (_, i) => kind === "paper" ? 512 * i + 255 : 2 * i + 1), 0);
+      entry.append(ends[kind][0], bar, ends[kind][1]);
       return entry;
     }));
-  }
-
-  bar(canvas, kind) {
-    Object.assign(canvas, { width: 128, height: 1, className: "bar" });
-    this.paint(canvas, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
-  }
-
-  /** AoLP by direction: opposite directions are one angle. The paper's map is brighter for larger DoLP, the radius. */
-  wheel_legend(canvas, kind) {
-    const size = 64, middle = (size - 1) / 2;
-    Object.assign(canvas, { width: size, height: size, className: "wheel" });
-    this.paint(canvas, kind, Uint16Array.from({ length: size * size }, (_, i) => {
-      const across = i % size - middle, up = middle - Math.floor(i / size);
-      const angle = Math.floor((Math.atan2(up, across) / Math.PI + 2) * 256) % 256;
-      return kind === "aolp" ? angle : 256 * angle + Math.min(255, Math.round(255 * Math.hypot(across, up) / middle));
-    }), 0);
   }
 
   /** Colour one byte a pixel, or two for the paper's map: AoLP is the hue, and DoLP scales the colour (V = DoLP). */
@@ -207,19 +165,7 @@ class Player {
     this.find("ms").textContent = ms;
     this.find("time").setAttribute("aria-valuetext", ms);
     for (const pane of this.panes) this.paint(pane.canvas, pane.map.kind, pane.map.values, this.frame);
-    this.wipe();
     this.read(false);
-  }
-
-  wipe() {
-    const [left, right] = ["left", "right"].map((role) => this.panes[this.find(role).value]);
-    const canvas = this.find("wiped"), edge = Math.round(this.find("divide").value / 100 * this.scene.width);
-    Object.assign(canvas, { width: this.scene.width, height: this.scene.height });
-    const context = canvas.getContext("2d");
-    context.drawImage(right.canvas, 0, 0);
-    if (edge > 0) context.drawImage(left.canvas, 0, 0, edge, canvas.height, 0, 0, edge, canvas.height);
-    this.find("wipe").style.setProperty("--edge", `${this.find("divide").value}%`);
-    this.find("divide").setAttribute("aria-valuetext", `${left.title} on ${this.find("divide").value} % of the width`);
   }
 
   play(start) {
@@ -238,12 +184,6 @@ class Player {
     this.find("zoom").value = this.view.zoom;
     for (const [name, unit] of [["zoom", ""], ["x", "%"], ["y", "%"]]) this.root.style.setProperty(`--${name}`, this.view[name] + unit);
     this.mark();
-  }
-
-  wheel(event) {
-    if (!event.ctrlKey && !event.shiftKey) return; // the page scrolls
-    event.preventDefault();
-    this.look({ zoom: Math.min(8, Math.max(1, this.view.zoom * (event.deltaY + event.deltaX < 0 ? 1.25 : 0.8))) });
   }
 
   point(event) {

@@ -1,8 +1,10 @@
-"""Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value."""
+"""Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value.
+
+`plot_events`, `plot_frame` and `plot_prediction` return pictures that a notebook shows and that `save` writes.
+"""
 
 import functools
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -26,7 +28,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.videos import VideoWriter, with_even_sides
-from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 from polarnet.storage.true_frames import TrueFrame, TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
@@ -34,10 +36,9 @@ MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensor
 GAP, MARGIN = 8, 12
 FONT_SIZE = 13  # pixels
 LINE = 22  # height of a line of text
-TEXTS = 64  # drawn lines of text that are kept
-BAR = (10, 120)  # height and width of the colour bar of DoLP
-TEXT_COLOUR = np.array([31, 35, 40], np.float32)
-
+BAR = (120, 10)  # width and height of the colour bar of DoLP
+TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
+EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
 
 Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
 """Maps of a row of a sheet, by caption."""
@@ -60,11 +61,18 @@ class Sheet:
 
     def picture(self, rows: Sequence[Captioned], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Rows of captioned maps above a line of text and the colour bar of DoLP, with even sides."""
-        drawn = [self._row(row) for row in rows if row]
-        width = max(row.shape[1] for row in drawn)
-        parts = [_widened(part, width) for row in drawn for part in (row, _white(GAP, width))]
-        sheet = np.concatenate([*parts[:-1], self._foot(width, foot)])
-        return with_even_sides(np.pad(sheet, ((GAP, GAP), (MARGIN, MARGIN), (0, 0)), constant_values=255))
+        height, width = self._size
+        rows = [row for row in rows if row]
+        columns = max(map(len, rows))
+        below = GAP + len(rows) * (LINE + height + GAP)
+        sheet = Image.new("RGB", (2 * MARGIN + columns * (width + GAP) - GAP, below + LINE + 6), "white")
+        for row, maps in enumerate(rows):
+            for column, (caption, image) in enumerate(maps.items()):
+                left, top = MARGIN + column * (width + GAP), GAP + row * (LINE + height + GAP)
+                sheet.paste(_line(caption, width), (left, top))
+                sheet.paste(Image.fromarray(self._panel(image)), (left, top + LINE))
+        self._foot(sheet, below - 2, foot)
+        return with_even_sides(np.array(sheet))
 
     def truth(
         self, channels: Sequence[Events], truth: TrueFrame, span_us: tuple[int, int], gamma: float = 1.0
@@ -84,48 +92,34 @@ class Sheet:
         rows = [dict(events[:2]) | above, dict(events[2:]) | below]
         return self.picture(rows, foot_of(span_us, sum(map(len, channels))))
 
-    def _row(self, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def _panel(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         height, width = self._size
-        parts = []
-        for caption, image in maps.items():
-            enlarged = height > image.shape[0]
-            method = cv2.INTER_NEAREST if enlarged else cv2.INTER_AREA
-            panel = image if image.shape[:2] == self._size else cv2.resize(image, (width, height), interpolation=method)
-            framed = panel.copy()
-            framed[[0, -1]], framed[:, [0, -1]] = 200, 200  # white maps would have no edge
-            parts += [np.concatenate([_head(caption, width), framed]), _white(LINE + height, GAP)]
-        return np.concatenate(parts[:-1], axis=1)
+        method = cv2.INTER_NEAREST if height > image.shape[0] else cv2.INTER_AREA
+        panel = cv2.resize(image, (width, height), interpolation=method)
+        panel[[0, -1]], panel[:, [0, -1]] = EDGE_COLOUR, EDGE_COLOUR  # white maps would have no edge
+        return panel
 
-    def _foot(self, width: int, text: str) -> UInt8[np.ndarray, "h2 w2 3"]:
-        foot = _white(LINE + 6, width)
-        _write(foot[6:], text, 0)
-        height, length = BAR
-        bar = DOLP_TABLE[np.linspace(0, len(DOLP_TABLE) - 1, length).round().astype(int)]
-        end = width - _text("1").shape[1] - 2
-        top = 6 + (LINE - height) // 2
-        left = end - 4 - length
-        if left > _text(text).shape[1] + 60:
-            foot[top : top + height, left : left + length] = bar
-            _write(foot[6:], "1", end)
-            _write(foot[6:], "DoLP 0", left - 6 - _text("DoLP 0").shape[1])
-        return foot
-
-
-def true_pictures(
-    channels: Sequence[Events], truth: TrueFrames, gamma: float = 1.0
-) -> Iterator[tuple[UInt8[np.ndarray, "h w 3"], int]]:
-    """Yield a picture (`Sheet.truth`) and the number of events between each two true frames, with a progress bar."""
-    sheet = Sheet(channels[0].height, channels[0].width)
-    for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
-        span = int(truth.t_us[k - 1]), int(truth.t_us[k])
-        window = [slice_time(events, *span) for events in channels]
-        yield sheet.truth(window, truth[k], span, gamma), sum(map(len, window))
+    def _foot(self, sheet: Image.Image, top: int, text: str) -> None:
+        length, height = BAR
+        zero, one = (round(_font().getlength(label)) for label in ("DoLP 0", "1"))
+        left = sheet.width - MARGIN - one - 6 - length
+        sheet.paste(_line(text, sheet.width - 2 * MARGIN), (MARGIN, top))
+        if left - zero < MARGIN + _font().getlength(text) + EMPTY:
+            return
+        bar = Image.fromarray(DOLP_TABLE[None]).resize(BAR, Image.Resampling.NEAREST)
+        for part, place in (
+            (_line("DoLP 0", zero), left - 6 - zero), (_line("1", one), left + length + 4)
+        ):  # fmt: skip
+            sheet.paste(part, (place, top))
+        sheet.paste(bar, (left, top + (LINE - height) // 2))
 
 
 def write_true_video(
     path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Write the pictures of `true_pictures` as a video; returns the one with most events, None if there is none.
+    """Write a picture (`Sheet.truth`) of each two true frames as a video, with a progress bar.
+
+    Returns the picture with most events, None if there is none.
 
     >>> from pathlib import Path
     >>> import numpy as np
@@ -138,9 +132,12 @@ def write_true_video(
     >>> write_true_video(Path("grey.mp4"), [Events.empty(20, 30)] * 4, truth).dtype
     dtype('uint8')
     """
-    busiest, most = None, -1
+    sheet, busiest, most = Sheet(channels[0].height, channels[0].width), None, -1
     with VideoWriter(path, rate_hz) as video:
-        for picture, count in true_pictures(channels, truth, gamma):
+        for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
+            span = int(truth.t_us[k - 1]), int(truth.t_us[k])
+            window = [slice_time(events, *span) for events in channels]
+            picture, count = sheet.truth(window, truth[k], span, gamma), sum(map(len, window))
             video.add(picture)
             if count > most:
                 busiest, most = picture, count
@@ -153,34 +150,68 @@ def foot_of(span_us: tuple[int, int], count: int) -> str:
     return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
 
 
-def _white(height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:
-    return np.full((height, width, 3), 255, np.uint8)
+def plot_events(events: Sequence[Events]) -> Image.Image:
+    """ON (red) minus OFF (blue) events of each pixel, behind each of the four polarizers.
+
+    >>> from polarnet.events import Events
+    >>> from polarnet.reports import plot_events
+    >>> plot_events([Events.empty(20, 30)] * 4).mode
+    'RGB'
+    """
+    sheet = Sheet(events[0].height, events[0].width)
+    maps = sheet.events(torch.stack([polarity_sums(channel) for channel in events]))
+    captioned = {f"events, {angle}°": one for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)}
+    times = torch.cat([channel.t for channel in events])
+    span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
+    return Image.fromarray(sheet.picture([captioned], foot_of(span, len(times))))
 
 
-@functools.lru_cache(maxsize=TEXTS)
-def _head(caption: str, width: int) -> UInt8[np.ndarray, "height width 3"]:
-    """The caption above a panel, for reading only."""
-    head = _white(LINE, width)
-    _write(head, caption, 0)
-    head.setflags(write=False)
-    return head
+def plot_frame(s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> Image.Image:
+    """S0 (in [0, 1]), DoLP, AoLP (radians) and their polarization as hue, saturation and value.
+
+    >>> import torch
+    >>> from polarnet.reports import plot_frame
+    >>> plot_frame(torch.rand(20, 30), torch.rand(20, 30), torch.rand(20, 30)).mode
+    'RGB'
+    """
+    captioned = {
+        "S0": intensity_image(s0),
+        "DoLP": dolp_image(dolp),
+        "AoLP (hue), DoLP (saturation)": angle_image(dolp, aolp),
+        "polarization and S0": polarization_hsv(s0, dolp, aolp),
+    }
+    return Image.fromarray(Sheet(*dolp.shape).picture([captioned], ""))
 
 
-def _widened(part: UInt8[np.ndarray, "h w 3"], width: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    return np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
+def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = None) -> Image.Image:
+    """DoLP, AoLP and the expected error of one predicted frame, with the true `dolp` and the error if it is given.
+
+    >>> import torch
+    >>> from polarnet.reports import plot_prediction
+    >>> from polarnet.stokes import Prediction
+    >>> plot_prediction(Prediction(torch.rand(20, 30)), torch.rand(20, 30)).mode
+    'RGB'
+    """
+    captioned = {"DoLP": dolp_image(prediction.dolp)}
+    if prediction.aolp is not None:
+        captioned["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
+    if prediction.log_variance is not None:
+        captioned["expected error"] = dolp_image(torch.exp(prediction.log_variance / 2))
+    if dolp is not None:
+        captioned |= {"true DoLP": dolp_image(dolp), "error": dolp_image((prediction.dolp - dolp).abs())}
+    return Image.fromarray(Sheet(*prediction.dolp.shape).picture([captioned], ""))
 
 
-def _write(picture: UInt8[np.ndarray, "h w 3"], text: str, left: int) -> None:
-    """Draw a line of text into the picture, from the column `left`; what does not fit is cut off."""
-    ink = _text(text)[: picture.shape[0], : picture.shape[1] - left, None]
-    place = picture[: ink.shape[0], left : left + ink.shape[1]]
-    place[:] = np.rint(place * (1 - ink) + TEXT_COLOUR * ink).astype(np.uint8)
+@functools.lru_cache(maxsize=64)
+def _line(text: str, width: int) -> Image.Image:
+    """A line of text, for reading only; what does not fit into the width is cut off."""
+    line = Image.new("RGB", (width, LINE), "white")
+    ImageDraw.Draw(line).text(
+        (0, LINE - 6), text, fill=TEXT_COLOUR, font=_font(), anchor="ls"
+    )  # base line above the edge
+    return line
 
 
-@functools.lru_cache(maxsize=TEXTS)
-def _text(text: str) -> Float[np.ndarray, "line w"]:
-    """Coverage of each pixel of a line by the letters, in [0, 1]."""
-    font = ImageFont.truetype(findfont("DejaVu Sans"), FONT_SIZE)  # comes with matplotlib
-    line = Image.new("L", (math.ceil(font.getlength(text)), LINE))
-    ImageDraw.Draw(line).text((0, LINE - 6), text, fill=255, font=font, anchor="ls")  # its base line above the edge
-    return np.asarray(line) / 255
+@functools.cache
+def _font() -> ImageFont.FreeTypeFont:
+    return ImageFont.truetype(findfont("DejaVu Sans"), FONT_SIZE)  # comes with matplotlib

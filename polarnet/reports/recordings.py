@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
+from polarnet.captures.calibration import Alignment
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import Calibrated
 from polarnet.events.representations import event_tensor, polarity_sums
@@ -46,10 +47,11 @@ def draw_calibration(target: Calibrated, config: RecordingsConfig, path: Path) -
     """Write a picture of one target: the landmark in events and in pictures, agreement against lag, thresholds."""
     figure = Figure(figsize=(10, 6.4), layout="constrained")
     events, pictures, lags, levels = figure.subplots(2, 2).reshape(-1).tolist()
-    _draw_landmark_events(events, target, config)
-    _draw_landmark_pictures(pictures, target, config)
-    _draw_lags(lags, target)
-    _draw_thresholds(levels, target)
+    _draw_landmark(events, pictures, target, config)
+    lags.set(xlabel="lag of pictures against events, ms from the landmark's", ylabel="agreement", title="not refined")
+    levels.set(ylabel="contrast threshold, log intensity")
+    if target.alignment is not None:
+        _draw_alignment(lags, levels, target.alignment)
     figure.suptitle(
         f"{target.name}: {target.duration_us * 1e-6:.2f} s, hot pixels {', '.join(map(str, target.hot.values()))}"
     )
@@ -97,42 +99,30 @@ def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path
     path.write_bytes(png(figure))
 
 
-def _draw_landmark_events(axes: Axes, target: Calibrated, config: RecordingsConfig) -> None:
+def _draw_landmark(events: Axes, pictures: Axes, target: Calibrated, config: RecordingsConfig) -> None:
     for capture, colour in zip(EVENT_CAPTURES, COLOURS, strict=True):
         t_ms = (target.region_events_us[capture] - target.start_us[capture]) / 1000
-        axes.step(t_ms, np.arange(1, len(t_ms) + 1), where="post", color=colour, label=capture)
-    axes.axhline(config.negative_events, color="0.6", linewidth=0.8)
-    axes.set(xlim=(-SPAN_MS, SPAN_MS), xlabel="ms from the start", ylabel="negative events in the region")
-    axes.legend(fontsize=8)
-
-
-def _draw_landmark_pictures(axes: Axes, target: Calibrated, config: RecordingsConfig) -> None:
+        events.step(t_ms, np.arange(1, len(t_ms) + 1), where="post", color=colour, label=capture)
     for capture, colour in zip(INTENSITY_CAPTURES, COLOURS, strict=True):
         t_us, region = target.region_pictures[capture]
-        axes.plot((t_us - target.start_us[capture]) / 1000, region, ".-", color=colour, label=capture)
-    axes.axhline(config.dark_level, color="0.6", linewidth=0.8)
-    axes.set(xlim=(-SPAN_MS, SPAN_MS), xlabel="ms from the start", ylabel="mean in the region, of 255")
-    axes.legend(fontsize=8)
+        pictures.plot((t_us - target.start_us[capture]) / 1000, region, ".-", color=colour, label=capture)
+    for axes, limit, name in (
+        (events, config.negative_events, "negative events in the region"),
+        (pictures, config.dark_level, "mean in the region, of 255"),
+    ):
+        axes.axhline(limit, color="0.6", linewidth=0.8)
+        axes.set(xlim=(-SPAN_MS, SPAN_MS), xlabel="ms from the start", ylabel=name)
+        axes.legend(fontsize=8)
 
 
-def _draw_lags(axes: Axes, target: Calibrated) -> None:
-    axes.set(xlabel="lag of pictures against events, ms from the landmark's", ylabel="agreement")
-    if target.alignment is None:
-        axes.set_title("not refined")
-        return
-    for lag, colour in zip(target.alignment.lags, COLOURS, strict=True):
-        axes.plot(lag.searched_us / 1000, lag.agreements, color=colour)
-        axes.axvline(lag.lag_us / 1000, color=colour, linewidth=0.8)
-    axes.set_title(f"I0 - I45 + I90 - I135: {100 * target.alignment.residual:.2f} % of their mean")
-
-
-def _draw_thresholds(axes: Axes, target: Calibrated) -> None:
-    axes.set(ylabel="contrast threshold, log intensity")
-    if target.alignment is None:
-        return
+def _draw_alignment(lags: Axes, levels: Axes, alignment: Alignment) -> None:
+    for lag, colour in zip(alignment.lags, COLOURS, strict=True):
+        lags.plot(lag.searched_us / 1000, lag.agreements, color=colour)
+        lags.axvline(lag.lag_us / 1000, color=colour, linewidth=0.8)
+    lags.set_title(f"I0 - I45 + I90 - I135: {100 * alignment.residual:.2f} % of their mean")
     place = np.arange(len(EVENT_CAPTURES))
-    for offset, name in ((-0.2, "on"), (0.2, "off")):
-        values = [getattr(lag.thresholds, name) for lag in target.alignment.lags]
-        axes.bar(place + offset, values, 0.38, label=name.upper(), color=COLOURS[0] if name == "on" else COLOURS[2])
-    axes.set_xticks(place, EVENT_CAPTURES)
-    axes.legend(fontsize=8)
+    for offset, name, colour in ((-0.2, "on", COLOURS[0]), (0.2, "off", COLOURS[2])):
+        values = [getattr(lag.thresholds, name) for lag in alignment.lags]
+        levels.bar(place + offset, values, 0.38, label=name.upper(), color=colour)
+    levels.set_xticks(place, EVENT_CAPTURES)
+    levels.legend(fontsize=8)

@@ -1,10 +1,7 @@
 """Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 from polarnet.methods import is_rotating
@@ -36,7 +33,7 @@ class Column:
         return text.removeprefix("-") if float(text) == 0 else text
 
 
-COLUMNS = {
+COLUMNS: Mapping[str, Column] = {
     "mse": Column("MSE", 4, "low", True, ""),
     "psnr": Column("PSNR", 2, "high", True, " dB"),
     "ssim": Column("SSIM", 4, "high", True, ""),
@@ -82,8 +79,10 @@ PAPER_TABLE_2: Mapping[str, Scores] = {  # Yan et al., Photonics 2024, 11(5), 48
         "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
     },
 }
-
-
+WINDOW_RULE = (
+    "A window is the events between two frames of the truth, start included and end excluded; its truth is the frame "
+    "at its end."
+)
 ANOTHER_CAMERA = (
     "† Not ranked: another camera, one sensor behind a rotating polarizer, sees the same scenes and motions but other "
     "events than the rows with four polarizers."
@@ -118,7 +117,7 @@ class Table(NamedTuple):
 
 def score_table(
     scores: Scores,
-    columns: Mapping[str, Column] = MappingProxyType(COLUMNS),
+    columns: Mapping[str, Column] = COLUMNS,
     labels: Mapping[str, str] = LABELS,
     warmup_windows: float | int | None = None,
 ) -> Table:
@@ -133,39 +132,26 @@ def score_table(
     backbone = next((found for row in scores.values() if (found := row.get("lpips_backbone"))), None)
     if backbone and "lpips" in columns:
         columns = {**columns, "lpips": replace(columns["lpips"], label=f"LPIPS ({backbone})")}
-    keys = [key for key in columns if any(scores[method].get(key) is not None for method in scores)]
+    keys = [key for key in columns if any(row.get(key) is not None for row in scores.values())]
     methods = in_order(scores)
     ranked = [method for method in methods if not is_rotating(method)]
-    best = {key: _best(columns[key], [scores[m].get(key) for m in ranked]) for key in keys}
+    best = {key: _best(columns[key], [scores[method].get(key) for method in ranked]) for key in keys}
     rows = tuple(
         Row(
             method,
             labels.get(method, method),
-            tuple(
-                _cell(
-                    columns[key],
-                    scores[method].get(key),
-                    scores[method].get(f"{key}_ci"),
-                    best[key] if method in ranked else None,
-                )
-                for key in keys
-            ),
+            tuple(_cell(columns[key], key, scores[method], best[key] if method in ranked else None) for key in keys),
         )
         for method in methods
     )
-    about = f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}." if backbone else ""
-    notes = [about] if about and "lpips" in keys else []
-    notes += [] if warmup_windows is None else [window_rule(warmup_windows)]
-    notes += [ANOTHER_CAMERA] if len(ranked) < len(methods) else []
+    notes = []
+    if backbone and "lpips" in keys:
+        notes.append(f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}.")
+    if warmup_windows is not None:
+        notes.append(f"{WINDOW_RULE} The first {warmup_windows} windows of each sequence count for no method.")
+    if len(ranked) < len(methods):
+        notes.append(ANOTHER_CAMERA)
     return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
-
-
-def window_rule(warmup_windows: float | int) -> str:
-    """The sentence beside a table: what a window is, and which windows count."""
-    return (
-        "A window is the events between two frames of the truth, start included and end excluded; its truth is the "
-        f"frame at its end. The first {warmup_windows} windows of each sequence count for no method."
-    )
 
 
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
@@ -178,7 +164,8 @@ def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
 
     `groups` split the columns into equal runs, left to right; a heading starts with the name of its group.
     """
-    headings = _grouped(table, groups)
+    width = len(table.headings) // max(1, len(groups))
+    headings = [f"{groups[k // width]} {one}" if groups else one for k, one in enumerate(table.headings)]
     lines = ["| | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]
     for row in table.rows:
         cells = (
@@ -188,15 +175,6 @@ def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
         )
         lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
     return "\n".join(lines + [f"\n{note}" for note in table.notes])
-
-
-def as_csv(table: Table, groups: Sequence[str] = ()) -> str:
-    """Comma-separated values as printed, with a line of headings; `groups` as in `as_markdown`."""
-    lines = io.StringIO()
-    writer = csv.writer(lines, lineterminator="\n")
-    writer.writerow(["method", *_grouped(table, groups)])
-    writer.writerows([row.label, *(cell.text for cell in row.cells)] for row in table.rows)
-    return lines.getvalue().rstrip("\n")
 
 
 def as_latex(table: Table, groups: Sequence[str] = ()) -> str:
@@ -212,14 +190,6 @@ def as_latex(table: Table, groups: Sequence[str] = ()) -> str:
     return "\n".join(
         [*lines, rf"{head} \\", r"\midrule", *(rf"{row} \\" for row in body), r"\bottomrule", r"\end{tabular}"]
     )
-
-
-def _grouped(table: Table, groups: Sequence[str]) -> list[str]:
-    """Headings with the name of their group before them."""
-    if not groups:
-        return [*table.headings]
-    width = len(table.headings) // len(groups)
-    return [f"{groups[k // width]} {heading}" for k, heading in enumerate(table.headings)]
 
 
 def as_plain(table: Table) -> str:
@@ -243,9 +213,9 @@ def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
     return column.printed(min(known) if column.better == "low" else max(known))
 
 
-def _cell(column: Column, value: float | int | None, interval: Sequence[float | int] | None, best: str | None) -> Cell:
-    if value is None:
+def _cell(column: Column, key: str, scores: Mapping[str, Any], best: str | None) -> Cell:
+    if (value := scores.get(key)) is None:
         return Cell("-", "", False)
-    ends = "" if interval is None else " to ".join(column.printed(end) for end in interval)
+    interval = " to ".join(column.printed(end) for end in scores.get(f"{key}_ci") or ())
     text = column.printed(value)
-    return Cell(text, ends, text == best)
+    return Cell(text, interval, text == best)

@@ -51,21 +51,18 @@ def _is_store(path: Path) -> bool:
 
 
 def _joined(parts: Sequence[Film]) -> list[Film]:
-    """One film for each name, with the maps of equal times and sizes; others get a film named after their first map.
-
-    Further films of one name and kind are numbered from 2.
-    """
+    """One film for each name, with the maps of equal times and sizes; others get a film named after their first map."""
     films: dict[str, Film] = {}
     for part in sorted(parts, key=lambda film: film.maps[0].kind == "events"):  # the truth sets the times
-        name, known = part.name, films.get(part.name)
+        known = films.get(part.name)
         if known is None:
-            films[name] = part
+            films[part.name] = part
         elif list(known.t_us) == list(part.t_us) and known.maps[0].frames.shape == part.maps[0].frames.shape:
-            films[name] = known._replace(maps=[*part.maps, *known.maps])
+            films[part.name] = known._replace(maps=[*part.maps, *known.maps])
         else:
-            alone = f"{name}, {part.maps[0].kind}"
-            names = [alone, *(f"{alone} {number}" for number in range(2, len(parts) + 1))]
-            films[next(free for free in names if free not in films)] = part
+            name = f"{part.name}, {part.maps[0].kind}"
+            name = name if name not in films else f"{name} {len(films)}"
+            films[name] = part._replace(name=name)
     return list(films.values())
 
 

@@ -1,4 +1,4 @@
-"""The event budget and the sensitivity as their commands run them, on the small simulated sequences."""
+"""The event budget as its command runs it, on the small simulated sequences."""
 
 import json
 from dataclasses import asdict
@@ -55,8 +55,7 @@ def weights(tmp_path_factory):
 
 
 @pytest.mark.thorough
-def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(config, weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "SLIDING_FRAMES", 3)
+def test_the_event_budget_asks_its_questions_on_the_test_sequences_alone(config, weights, tmp_path):
     results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, weights)
     assert results["sequences"] == ["d-0"]
     assert {path.name for path in (tmp_path / "out").glob("figure_11*")} == {
@@ -64,8 +63,6 @@ def test_the_event_budget_asks_its_three_questions_on_the_test_sequences_alone(c
     }
     assert set(results["since_start"]) == set(results["window_length"]) == {"oracle_mean", "ours"}
     assert [entry["window_us"] for entry in results["window_length"]["ours"]] == list(studies.WINDOW_LENGTHS_US)
-    assert {entry["spacing_us"] for entry in results["sliding"]} == {studies.SPACING_US}
-    assert (results["between"]["window_us"], results["between"]["spacing_us"]) == (33_333, studies.SPACING_US)
     assert json.loads((tmp_path / "out" / "event_budget.json").read_text()) == results
     assert matplotlib.image.imread(tmp_path / "out" / "event_budget.png").std() > 0
 
@@ -75,17 +72,7 @@ def test_the_event_budget_needs_the_network(config, tmp_path):
         studies.run_event_budget(config, tmp_path, ["zeros"], None, tmp_path / "none.safetensors")
 
 
-@pytest.mark.thorough
-def test_the_sensitivity_changes_one_setting_at_a_time_and_no_truth(config, tmp_path):
-    results = studies.run_sensitivity(config, tmp_path / "out", ["zeros", "cf"], None, None)
-    assert json.loads((tmp_path / "out" / "sensitivity.json").read_text()) == results
-    assert matplotlib.image.imread(tmp_path / "out" / "sensitivity.png").std() > 0
-    for setting in ("threshold_mismatch", "noise_rate_hz", "channel_error"):
-        zeros = [entry["scores"]["zeros"] for entry in results["settings"][setting]]
-        assert all(scores == zeros[0] for scores in zeros), setting
-
-
 @pytest.mark.parametrize(("methods", "got"), [(["zeros", "magic"], "magic"), ([], "none")])
 def test_a_method_that_does_not_exist_is_refused_with_those_that_do(config, tmp_path, methods, got):
     with pytest.raises(ValueError, match=f"--methods: expected some of zeros, .*, got {got}"):
-        studies.run_sensitivity(config, tmp_path, methods, None, None)
+        studies.run_event_budget(config, tmp_path, methods, None, None)

@@ -36,11 +36,6 @@ def picture(phase):
     return (1 - down[..., None] * (0.5 - 0.5 * np.cos(hue))).astype(np.float32)
 
 
-@pytest.fixture(scope="session")
-def source_picture():
-    return picture
-
-
 def write_images(folder):
     folder.mkdir()
     entries = []
@@ -106,23 +101,26 @@ def run_methods(events, frames, folder):
 
 
 @pytest.fixture(scope="session")
-def paths(tmp_path_factory):
+def data(tmp_path_factory):
+    """The folder of a pipeline's outputs."""
     data = tmp_path_factory.mktemp("data")
-    paths = ReportPaths(
-        data / "images", data / "scenes.zarr", data / "frames.zarr", data / "events.zarr", data / "train",
-        data / "benchmark",
-    )  # fmt: skip
-    write_images(paths.images)
+    write_images(data / "images")
     motion = SynthesizeConfig(
         sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, sensor_height=24, sensor_width=36,
         speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
     )  # fmt: skip
-    synthesize(Synthesis(paths.images, motion, 1, 2), paths.scenes, paths.frames, map)
-    frames = FrameStore.open(paths.frames)
-    write_events(paths.events, frames)
-    run_methods(EventStore.open(paths.events), frames, paths.simulated)
-    for folder, network in ((paths.train / "ours", "paper"), (paths.train / "e2v", "firenet")):
+    synthesize(Synthesis(data / "images", motion, 1, 2), data / "scenes.zarr", data / "frames.zarr", map)
+    frames = FrameStore.open(data / "frames.zarr")
+    write_events(data / "events.zarr", frames)
+    run_methods(EventStore.open(data / "events.zarr"), frames, data / "benchmark" / "sets" / "simulated")
+    for name, network in (("ours", "paper"), ("e2v", "firenet")):
+        folder = data / "train" / name
         folder.mkdir(parents=True)
         write_history(folder, HISTORY)
         (folder / "best.json").write_text(json.dumps({"network": network}))
-    return paths
+    return data
+
+
+@pytest.fixture(scope="session")
+def paths(data):
+    return ReportPaths(data / "images", data / "scenes.zarr", data / "train", data / "benchmark")

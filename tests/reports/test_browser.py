@@ -27,9 +27,9 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def files(paths, tmp_path_factory):
+def files(data, paths, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
-    films = films_of(paths.frames)
+    films = films_of(data / "frames.zarr")
     return {
         "report": write_report(paths, ["e2v"], RUN, folder),
         "viewer": write_player(folder / "view.html", "frames.zarr", films, {"command": "polarnet view frames.zarr"}),
@@ -37,7 +37,7 @@ def files(paths, tmp_path_factory):
 
 
 def picture(page, role):
-    return page.evaluate(f"document.querySelector('[data-role={role}] canvas, canvas[data-role={role}]').toDataURL()")
+    return page.evaluate(f"document.querySelector('[data-role={role}] canvas').toDataURL()")
 
 
 @pytest.mark.parametrize("name", ["report", "viewer"])
@@ -58,10 +58,8 @@ def test_axe_finds_no_serious_fault(browser, files, name):
         assert axe_serious(page) == []
 
 
-def test_all_images_load_and_all_charts_are_drawn(browser, files):
+def test_all_charts_are_drawn(browser, files):
     with opened(browser, files["report"], 1400, "light") as (page, _):
-        assert page.evaluate("[...document.images].length") > 3
-        assert page.evaluate("[...document.images].every((image) => image.complete && image.naturalWidth > 0)")
         assert page.locator(".chart svg").count() > 5
 
 
@@ -72,19 +70,6 @@ def test_the_time_slider_changes_the_picture_and_its_time(browser, files):
         page.keyboard.press("ArrowRight")
         assert picture(page, "panes") != before
         assert page.inner_text("[data-role=ms]") != time
-
-
-def test_the_wipe_shows_one_picture_at_each_end_and_both_between(browser, files):
-    with opened(browser, files["report"], 800, "light") as (page, _):
-        pictures = []
-        for place in (0, 50, 100):
-            page.locator("[data-role=divide]").fill(str(place))
-            pictures.append(picture(page, "wiped"))
-        panes = page.evaluate("[...document.querySelectorAll('.panes canvas')].map((c) => c.toDataURL())")
-        left, right = (int(page.input_value(f"[data-role={side}]")) for side in ("left", "right"))
-        assert pictures[0] == panes[right]
-        assert pictures[2] == panes[left]
-        assert len(set(pictures)) == 3
 
 
 def test_play_moves_on_and_pause_stops(browser, files):

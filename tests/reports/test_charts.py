@@ -2,20 +2,18 @@ import re
 
 import pytest
 
-from polarnet.reports.artefacts import BudgetPoint, History, Results
+from polarnet.reports.artefacts import History, Results
 from polarnet.reports.charts import (
-    budget_chart,
-    loss_chart,
-    psnr_chart,
+    event_budget_figure,
     reliability_chart,
     scatter_chart,
     score_chart,
     sets_chart,
-    spread_chart,
-    term_label,
+    training_chart,
 )
-from polarnet.reports.html import svg
+from polarnet.reports.figures import svg
 from polarnet.reports.legend import GENERAL
+from polarnet.reports.maps import png
 from polarnet.reports.tables import COLUMNS
 
 METRICS = {
@@ -23,45 +21,37 @@ METRICS = {
     "ours": {"mse": 0.02, "mse_ci": [0.01, 0.03], "psnr": None},
 }
 MEANS = {"cf": {"lake": 0.2, "park": 0.1}, "ours": {"lake": 0.02, "park": 0.03}}
-HISTORY = History("polarnet", {"mse": [0.3, 0.1]}, {"psnr": [9.0, 10.0]}, 1)
-POINTS = [BudgetPoint("ours", 0.0, 0.3, 1), BudgetPoint("ours", 2.0, 0.1, 4), BudgetPoint("cf", 2.0, 0.2, 4)]
 
 
-def lines(figure):
+def lines(axes):
     """Points of each line, as pairs."""
-    return [list(zip(*line.get_data(), strict=True)) for line in figure.axes[0].lines]
+    return [list(zip(*line.get_data(), strict=True)) for line in axes.lines]
 
 
 def test_a_score_keeps_its_interval_and_a_method_without_the_score_has_no_row():
     figure = score_chart(METRICS, "mse", COLUMNS["mse"], GENERAL)
-    assert lines(figure)[2:] == [[(0.01, 1), (0.03, 1)], [(0.02, 1)]]
+    assert lines(figure.axes[0])[2:] == [[(0.01, 1), (0.03, 1)], [(0.02, 1)]]
     psnr = score_chart(METRICS, "psnr", COLUMNS["psnr"], GENERAL)
     assert [tick.get_text() for tick in psnr.axes[0].get_yticklabels()] == ["oracle mean"]
 
 
-def test_every_scene_is_a_dot_of_its_method_and_the_diagonal_says_where_two_are_equal():
-    diagonal, dots = lines(scatter_chart(MEANS, "cf", GENERAL))
+def test_every_scene_is_a_dot_and_the_diagonal_says_where_two_methods_are_equal():
+    diagonal, dots = lines(scatter_chart(MEANS, "cf", GENERAL).axes[0])
     assert all(x == y for x, y in diagonal)
     assert set(dots) == {(0.2, 0.02), (0.1, 0.03)}
-    assert [len(points) for points in lines(spread_chart(MEANS, GENERAL))] == [2, 1, 2, 1]  # scenes, median
 
 
-def test_a_method_keeps_its_colour_in_the_event_budget_and_zero_events_have_no_place_on_its_axis():
-    own = {line.get_label(): line for line in budget_chart(POINTS, GENERAL).axes[0].lines}[GENERAL.label("ours")]
-    assert own.get_color() == GENERAL.colour("ours")
-    assert list(own.get_xdata()) == [2.0]
-
-
-def test_epochs_count_from_one():
-    assert lines(loss_chart(HISTORY)) == [[(1, 0.3), (2, 0.1)]]
-    assert lines(psnr_chart(HISTORY, "DoLP")) == [[(1, 9.0), (2, 10.0)]]
+def test_epochs_of_a_training_count_from_one():
+    loss, psnr = training_chart(History("polarnet", {"mse": [0.3, 0.1]}, {"psnr": [9.0, 10.0]}, 1), "DoLP").axes
+    assert lines(loss) == [[(1, 0.3), (2, 0.1)]]
+    assert lines(psnr) == [[(1, 9.0), (2, 10.0)]]
 
 
 def test_a_set_is_a_column_of_errors_relative_to_its_best_constant():
     sets = [Results(name, METRICS | {"cf": {"mse": cf}}, {}, []) for name, cf in (("simulated", 0.06), ("mine", None))]
-    figure = sets_chart(sets, {"simulated": "Simulated"}, GENERAL)
-    assert [text.get_text() for text in figure.axes[0].texts] == ["2.00", "0.67", "0.67"]
-    assert [tick.get_text() for tick in figure.axes[0].get_xticklabels()] == ["Simulated", "mine"]
+    axes = sets_chart(sets, {"simulated": "Simulated"}, GENERAL).axes[0]
+    assert [text.get_text() for text in axes.texts] == ["2.00", "0.67", "0.67"]
+    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["Simulated", "mine"]
 
 
 @pytest.mark.parametrize("figure", [
@@ -71,16 +61,20 @@ def test_a_set_is_a_column_of_errors_relative_to_its_best_constant():
 def test_a_drawing_takes_its_colours_from_the_page_and_has_the_same_bytes_each_time(figure):
     drawing = svg(figure())
     assert drawing == svg(figure())
-    assert (
-        {"var(--text)", "var(--quiet)", "var(--line)"} >= set(re.findall(r"var\(--\w+\)", drawing)) > {"var(--quiet)"}
-    )
+    colours = set(re.findall(r"var\(--\w+\)", drawing))
+    assert {"var(--text)", "var(--quiet)", "var(--line)"} >= colours > {"var(--quiet)"}
     assert "#00000" not in drawing
     assert "<text" in drawing
     assert all(name.startswith(("p", "m")) for name in re.findall(r' id="(\w+)"', drawing))  # clips and markers
 
 
-def test_every_term_of_the_losses_has_a_readable_name():
-    terms = ["total", "mse", "mae", "ssim_loss", "lpips", "stokes", "intensity_lpips", "aolp_ssim_loss"]
-    labels = [term_label(term) for term in terms]
-    assert labels[-2:] == ["intensity: LPIPS", "AoLP: 1 - SSIM"]
-    assert not [label for label in labels if "_" in label]
+def test_the_event_budget_marks_the_papers_answer_and_has_the_same_bytes_each_time():
+    scores = {"psnr": 10.3, "corr": 0.3}
+    results = {
+        "since_start": {"cf": [{"events_per_pixel": x, **scores} for x in (0.2, 1.1, 4.0)]},
+        "window_length": {"cf": [{"window_us": x, **scores} for x in (5000, 33333)]},
+    }
+    figure = event_budget_figure(results)
+    assert any(line.get_linestyle() == "--" and line.get_xdata()[0] == 1.04 for line in figure.axes[0].lines)
+    assert lines(figure.axes[1]) == [[(5.0, 10.3), (33.333, 10.3)]]
+    assert png(figure) == png(event_budget_figure(results))

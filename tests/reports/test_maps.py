@@ -10,7 +10,6 @@ from polarnet.reports.maps import (
     encode_png,
     event_full_scale,
     event_image,
-    hue_wheel,
     intensity_image,
     paper_map,
     polarization_hsv,
@@ -39,16 +38,6 @@ def test_the_papers_map_has_the_angle_as_hue_and_dolp_as_value():
     assert tuple(paper_map(pixel(0), pixel(1.0))[0, 0]) == (0, 0, 0)
 
 
-@pytest.mark.parametrize(("direction_deg", "colour"), [(0, RED), (60, GREEN), (120, BLUE), (180, RED), (240, GREEN)])
-def test_the_wheel_shows_at_each_direction_the_colour_of_that_angle(direction_deg, colour):
-    size = 401
-    wheel = hue_wheel(size)
-    middle, radius = size // 2, 196
-    row = middle - round(radius * math.sin(math.radians(direction_deg)))
-    column = middle + round(radius * math.cos(math.radians(direction_deg)))
-    assert wheel[row, column, :3].astype(int) == pytest.approx(colour, abs=10)
-
-
 def test_on_is_red_off_is_blue_and_no_event_is_white():
     on, off, none = event_image(torch.tensor([[3.0, -3.0, 0.0]]), full_scale=3.0)[0].tolist()
     assert on[0] > max(on[1:])
@@ -61,9 +50,6 @@ def test_full_scale_ignores_pixels_without_events_and_a_hot_pixel():
     events[0, 0, :1000] = -2.0
     events[0, 0, 5000] = 900.0
     assert event_full_scale(events) == 2.0
-
-
-def test_full_scale_of_no_events_is_one():
     assert event_full_scale(torch.zeros(4, 3, 3)) == 1.0
 
 

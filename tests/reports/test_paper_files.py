@@ -1,19 +1,20 @@
 """The paper's Table 2 and its figures as files, from a run in miniature."""
 
-import csv
-
 import cv2
+import numpy as np
 import pytest
 import torch
 
 from polarnet.events.stream import Events
 from polarnet.reports.artefacts import read_results
 from polarnet.reports.legend import legend_of
-from polarnet.reports.paper import Moment, figure_11, write_paper_files
+from polarnet.reports.maps import png
+from polarnet.reports.paper import Moment, comparison_figure, figure_11, score_line, write_paper_files
 from polarnet.reports.recordings import draw_sequence
 from polarnet.storage.frames import Frames
+from polarnet.storage.panels import Panel, Shown, fraction_bytes
 
-ENDINGS = ("png", "pdf")
+TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
 
 
 @pytest.fixture
@@ -23,25 +24,21 @@ def results(paths):
     return [simulated._replace(name="simulated"), simulated._replace(name="recordings", metrics=real)]
 
 
-def test_table_2_has_both_experiments_side_by_side_in_three_formats(results, tmp_path):
+def test_table_2_has_both_experiments_side_by_side_without_constants(results, tmp_path):
     write_paper_files(tmp_path, results, legend_of(results[0].details["weights"]))
-    head, *rows = csv.reader((tmp_path / "table_2.csv").read_text().splitlines())
-    assert head[1:] == [
-        f"{half} {metric}" for half in ("Real", "Simulated") for metric in ("MSE ↓", "PSNR ↑", "SSIM ↑")
-    ]
-    assert [row[0] for row in rows] == [
-        "E2V: FireNet",
-        "ours: the paper's network",
-    ]  # no constants
-    simulated = results[0].metrics["e2v"]
-    assert rows[0][1:] == [f"{v:.{n}f}" for v, n in ((simulated["mse"] / 2, 4), (simulated["psnr"], 2),
-        (simulated["ssim"], 4), (simulated["mse"], 4), (simulated["psnr"], 2), (simulated["ssim"], 4))]  # fmt: skip
     text = (tmp_path / "table_2.md").read_text()
-    assert f"| E2V: FireNet | {rows[0][1]} |" in text
+    head, _, *rows = [line for line in text.splitlines() if line.startswith("|")]
+    metrics = [f"{half} {metric}" for half in ("Real", "Simulated") for metric in ("MSE ↓", "PSNR ↑", "SSIM ↑")]
+    assert [cell.strip() for cell in head.strip("|").split("|")][1:] == metrics
+    assert [row.split(" | ")[0] for row in rows] == ["| E2V: FireNet", "| ours: the paper's network"]
+    simulated = results[0].metrics["e2v"]
+    psnr, ssim = f"{simulated['psnr']:.2f}", f"{simulated['ssim']:.4f}"
+    numbers = [f"{simulated['mse'] / 2:.4f}", psnr, ssim, f"{simulated['mse']:.4f}", psnr, ssim]
+    assert [cell.split("<br>")[0].strip() for cell in rows[0].strip("|").split("|")][1:] == numbers
     assert "The first 1 windows of each sequence count for no method." in text
     latex = (tmp_path / "table_2.tex").read_text().splitlines()
     assert r" & \multicolumn{3}{c}{Real} & \multicolumn{3}{c}{Simulated} \\" in latex
-    assert any(line.startswith(f"E2V: FireNet & {rows[0][1]} & ") and line.endswith(r" \\") for line in latex)
+    assert any(line.startswith(f"E2V: FireNet & {numbers[0]} & ") and line.endswith(r" \\") for line in latex)
     assert r"\textbf{" in latex[-3]
 
 
@@ -78,3 +75,29 @@ def test_figure_11_says_when_and_of_how_many_events():
     figure = figure_11([Moment(24_000, 79_191, maps, maps, maps), Moment(35_000, 100_000, maps, maps, maps)])
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[:2] == ["t = 24.0 ms, n = 79,191", "t = 35.0 ms, n = 100,000"]
+
+
+def scene(*methods):
+    film, times = fraction_bytes(TRUTH)[None], torch.tensor([33_333])
+    truth, half = (Shown(dolp, None, film, None) for dolp in (TRUTH, TRUTH / 2))
+    return Panel(
+        "tree", 0, 33_333, torch.zeros(4, 24, 36), TRUTH, times, film, film, truth, dict.fromkeys(methods, half)
+    )
+
+
+def panel(*rows):
+    return png(comparison_figure(rows, rows[0].predictions))
+
+
+def test_a_comparison_grows_by_a_row_a_scene_and_a_column_a_method_without_constants():
+    def size(*rows):
+        return cv2.imdecode(np.frombuffer(panel(*rows), np.uint8), cv2.IMREAD_COLOR).shape[:2]
+
+    height, width = size(scene("ours"))
+    assert size(*[scene("ours")] * 2)[0] > 1.5 * height
+    assert size(scene("cf", "ours"))[1] > 1.2 * width
+    assert panel(scene("ours")) == panel(scene("zeros", "oracle_mean", "ours"))
+
+
+def test_a_frame_that_is_off_by_a_tenth_everywhere_scores_an_mse_of_a_hundredth_and_20_db():
+    assert score_line(torch.full((8, 8), 0.6), torch.full((8, 8), 0.5)) == "0.0100 · 20.00 dB"

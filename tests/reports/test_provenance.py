@@ -19,15 +19,9 @@ def project(tmp_path):
     return tmp_path
 
 
-def test_a_clean_clone_is_named_by_its_commit_alone(project):
+def test_edited_code_is_said_but_what_the_pipeline_writes_is_no_edit(project):
     assert len(facts(project)["commit"]) == 40
-
-
-def test_edited_code_is_said(project):
-    (project / "code.py").write_text("2\n")
-    assert facts(project)["commit"].endswith(", with uncommitted changes")
-
-
-def test_what_the_pipeline_writes_is_no_edit(project):
     (project / "dvc.lock").write_text("2\n")
     assert len(facts(project)["commit"]) == 40
+    (project / "code.py").write_text("2\n")
+    assert facts(project)["commit"].endswith(", with uncommitted changes")

@@ -6,8 +6,8 @@ from polarnet.cli import main
 from polarnet.reports.viewing import films_of
 
 
-def test_a_folder_gives_events_and_truth_of_a_sequence_in_one_film(paths):
-    films = {film.name: film for film in films_of(paths.events.parent)}
+def test_a_folder_gives_events_and_truth_of_a_sequence_in_one_film(data):
+    films = {film.name: film for film in films_of(data)}
     assert {one.kind for one in films["tree-00"].maps} == {"events", "s0", "dolp", "aolp"}
     assert {one.kind for one in films["tree-00: scene"].maps} == {"s0", "dolp", "aolp"}
 
@@ -28,20 +28,19 @@ def test_times_of_a_recording_count_from_its_first_event(tmp_path):
     assert (film.t_us[0], film.t_us[-1]) == (10, 241)
 
 
-def test_an_unknown_sequence_is_refused_with_the_names_there_are(paths):
+def test_an_unknown_sequence_is_refused_with_the_names_there_are(data):
     with pytest.raises(ValueError, match=r"expected sequences among .*tree-00.*, got oak"):
-        films_of(paths.frames, ["oak"])
+        films_of(data / "frames.zarr", ["oak"])
 
 
-def test_a_path_without_anything_to_show_is_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="found none"):
-        films_of(tmp_path)
-    with pytest.raises(FileNotFoundError, match="no such path"):
-        films_of(tmp_path / "nowhere")
+@pytest.mark.parametrize(("name", "message"), [("", "found none"), ("nowhere", "no such path")])
+def test_a_path_without_anything_to_show_is_refused(tmp_path, name, message):
+    with pytest.raises(FileNotFoundError, match=message):
+        films_of(tmp_path / name)
 
 
-def test_the_command_writes_a_page_of_the_sequences_asked_for(paths, tmp_path):
+def test_the_command_writes_a_page_of_the_sequences_asked_for(data, tmp_path):
     page = tmp_path / "page.html"
-    assert main(["view", str(paths.frames), "--sequence", "tree-00", "--out", str(page), "--no-browser"]) == 0
+    assert main(["view", str(data / "frames.zarr"), "--sequence", "tree-00", "--out", str(page), "--no-browser"]) == 0
     assert '"name":"tree-00"' in page.read_text()
     assert "leaf-00" not in page.read_text()

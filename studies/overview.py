@@ -1,19 +1,33 @@
-"""The whole pipeline in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP."""
+"""The pipeline in one figure: photograph, polarization, four polarizers, four event streams, recovered DoLP.
 
-from typing import Any
+`studies.measure` draws it into docs/pictures/overview.png, from a run of the demo.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
+from torch import Tensor
 
 from polarnet.events.stream import Events
-from polarnet.reports.artefacts import Overview
-from polarnet.reports.figures import LIGHT, chart_style, draw_wheel, show_picture
+from polarnet.pictures.manifest import read_manifest
+from polarnet.reports.figures import LIGHT, chart_style, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image, polarization_hsv
+from polarnet.simulation.motion import Trajectory, sensor_to_scene
 from polarnet.stokes import POLARIZER_ANGLES_DEG
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.panels import Panel, read_panel
+from polarnet.storage.scenes import SceneStore
 
 ON, OFF = "#d0312d", "#1f5fb8"
 MAX_EVENTS = 25_000  # drawn per stream; above this number, every k-th event is drawn
@@ -26,6 +40,60 @@ MARGIN = 0.15
 ARROW = 0.68
 PICTURE_WIDTH = 2.0
 STREAM_WIDTH = 2.1
+
+
+class Overview(NamedTuple):
+    """One test sequence, from the picture that the sensor moved over to the DoLP recovered from one window."""
+
+    picture: UInt8[np.ndarray, "height width 3"]
+    path: Float[np.ndarray, "2 times"]
+    """Path of the sensor's centre over the sequence: x and y in pixels of the picture."""
+    outline: Float[np.ndarray, "2 corners"]
+    """Outline of the sensor at the end, in the same pixels."""
+    intensity: Float[Tensor, "4 h w"]
+    dolp: Float[Tensor, "h w"]
+    aolp: Float[Tensor, "h w"]
+    streams: Sequence[Events]
+    """Events of the four channels, from `start_us` on."""
+    start_us: int
+    duration_us: int
+    recovered: Float[Tensor, "h w"]
+
+
+def overview_of(data: Path) -> Overview:
+    """The panel of a photograph with the most varied DoLP, from the outputs of a pipeline in `data`."""
+    scenes = SceneStore.open(data / "scenes.zarr")
+    panels = [read_panel(path) for path in sorted((data / "benchmark/sets/simulated/panels").glob("*.npz"))]
+    photographs = {one.name for one in read_manifest(data / "images").pictures if one.source == "photograph"}
+    shown = [one for one in panels if scenes.scene_of[one.sequence] in photographs]
+    panel = max(shown, key=lambda one: float(one.truth.dolp.std()))
+    return overview_of_panel(
+        panel, scenes, FrameStore.open(data / "frames.zarr"), EventStore.open(data / "events.zarr")
+    )
+
+
+def overview_of_panel(panel: Panel, scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview:
+    """The window of a panel, with the events and frames behind it."""
+    scene = scenes.read(panel.sequence)
+    trajectory = Trajectory.from_vector(scene.trajectory.numpy())
+    path = trajectory.pose(np.linspace(0, scene.duration_us / 1e6, 200))
+    pose = [float(column[0]) for column in trajectory.pose(np.array([panel.t_us / 1e6]))]
+    height, width = scenes.sensor_height, scenes.sensor_width
+    left, top, along, across = sensor_to_scene(*pose, height, width)
+    columns, rows = np.array([[0, width, width, 0, 0], [0, 0, height, height, 0]])
+    start_us, frame = int(frames.t_us(panel.sequence)[panel.window]), frames.frames(panel.sequence)
+    return Overview(
+        picture=polarization_hsv(scene.s0, scene.dolp, scene.aolp),
+        path=np.stack([path.x, path.y]),
+        outline=np.stack([left + columns * along - rows * across, top + columns * across + rows * along]),
+        intensity=frame.intensity[panel.window + 1],
+        dolp=frame.dolp[panel.window + 1],
+        aolp=frame.aolp[panel.window + 1],
+        streams=events.read(panel.sequence, start_us, panel.t_us),
+        start_us=start_us,
+        duration_us=panel.t_us - start_us,
+        recovered=panel.predictions["ours"].dolp,
+    )
 
 
 def overview_figure(overview: Overview) -> Figure:
@@ -93,14 +161,40 @@ def _source(figure: Figure, x: float, overview: Overview) -> None:
     _heading(figure, x, "picture")
     axes = _picture(figure, x, TOP - height, height, overview.picture)
     for line in (overview.outline, overview.path):
-        across, down = line * np.array([[columns], [rows]])
-        axes.plot(across, down, color="black", linewidth=2.4, alpha=0.6)
-        axes.plot(across, down, color="white", linewidth=1.2)
+        axes.plot(*line, color="black", linewidth=2.4, alpha=0.6)
+        axes.plot(*line, color="white", linewidth=1.2)
     axes.set(xlim=(0, columns), ylim=(rows, 0))
-    draw_wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2), size=480, label_size=9.0)
+    _wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2))
     text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
     style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
     _text(figure, x + PICTURE_WIDTH / 2, 0.52, text, **style)
+
+
+def _wheel(axes: Axes) -> None:
+    """Draw `hue_wheel`, labelled with AoLP at 0, 45, 90 and 135 degrees."""
+    axes.imshow(hue_wheel(480))
+    axes.axis("off")
+    for angle, (across, up, sideways, upright) in {
+        "0°": (1.05, 0.5, "left", "center"), "45°": (0.87, 0.88, "left", "bottom"),
+        "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
+    }.items():  # fmt: skip
+        place: dict[str, Any] = {"transform": axes.transAxes, "ha": sideways, "va": upright}
+        axes.text(across, up, angle, color=LIGHT.quiet, fontsize=9.0, **place)
+
+
+def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
+    """The legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1. RGBA, transparent outside.
+
+    Opposite points have the same colour, since both directions of a line are one angle of polarization. Angles count
+    anticlockwise from the right, as on paper; the first row is the top.
+    """
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(axis, -axis)
+    radius = np.hypot(x, y)
+    hue = np.arctan2(y, x) / math.pi % 1.0
+    rgb = hsv_to_rgb(np.stack([hue, radius.clip(0, 1), np.ones_like(hue)], axis=-1))
+    edge = ((1 - radius) * size / 2).clip(0, 1)  # soft rim, one pixel wide
+    return np.rint(255 * np.concatenate([rgb, edge[..., None]], axis=-1)).astype(np.uint8)
 
 
 def _arrow(figure: Figure, x: float, text: str) -> float:
