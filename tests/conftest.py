@@ -211,14 +211,12 @@ def write_trial() -> Callable[..., None]:
         validation: Mapping[str, float] | None = None,
         test: Mapping[str, float] | None = None,
         failure: str | None = None,
-        log: str = "",
     ) -> None:
         loss = dict(zip(("mse", "ssim", "lpips"), weights, strict=True))
         config = {"seed": seed, "loss": loss, "lpips": {"backbone": "alex"}, "benchmark": {}}
         files = {
             ".hydra/config.yaml": json.dumps(config),
             ".hydra/overrides.yaml": json.dumps(list(overrides)),
-            "logs/train/train.log": log,
         }
         if validation or test:
             scores = validation or {"mse": 0.5, "psnr": 3.0}

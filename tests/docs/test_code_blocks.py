@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from polarnet.cli import main, parse
-from polarnet.config.overrides import check_overrides
+from polarnet.config.experiments import check_overrides
 from polarnet.config.tree import Config
 
 ROOT = Path(__file__).resolve().parents[2]
