@@ -239,7 +239,7 @@ def recordings(folder: Path) -> Case:
     """Small recordings of every format whose library is installed, as tests/recordings makes them."""
     sys.path[:0] = [str(ROOT / "tests" / "recordings"), str(ROOT / "tests")]
     from damaged_files import EVENTS, Sample
-    from recording_fixtures import random_events
+    from event_fixtures import random_events
 
     samples = [Sample(form, folder, random_events(0, EVENTS, 300_000, 260, 346)) for form in FORMATS]
 

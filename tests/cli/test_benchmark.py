@@ -75,7 +75,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
         assert words in printed
     page = (out / "index.html").read_text()
     for words in ("train_mean was left out", "mine.safetensors (sha256", "† Not ranked: another camera",
-                  "Sequences of 60x90 pixels (height x width), 0.2 s", "does not say what it was trained on"):  # fmt: skip
+                  "Sequences of 60x90 pixels (height x width), 0.2 s", "not say what it was trained on"):  # fmt: skip
         assert words in page
     assert 'src="http' not in page
     assert (out / "comparison.png").exists()
