@@ -46,11 +46,7 @@ SET_THEM = "To score on sequences like those of the training, add to the command
 PDAVIS = "90 45 / 135 0"
 PART = 2  # scenes
 NOT_ROTATING = "recordings hold the events of four channels, not those behind a rotating polarizer"
-RECORDED = {
-    "sentence": "Windows lie between the recordings' frames, whose polarization is the truth.",
-    "recorded": True,
-    "warnings": [],
-}
+RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarization is the truth."
 
 
 def run(options: argparse.Namespace) -> None:
@@ -118,11 +114,17 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             conditions = announced(used, metadata_used(methods, context), SET_THEM)
             notes = _make_scenes(options, config, root, work)
         else:
-            conditions, notes = RECORDED, _make_recordings(options, root, work, cleaning)
+            conditions = {"sentence": RECORDED_SENTENCE, "recorded": True, "warnings": []}
+            notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
         notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
         rotating = _rotating_events(config, work) if any(map(is_rotating, methods)) else None
         test_set = made_set(root.name, work, rotating)
-        benchmark = run_benchmark(test_set, context, settings, lpips, _on_one_thread_each(config))
+        mapper = config.mapper("benchmark")
+
+        def mapped(task: Callable[[str], Any], names: Sequence[str]) -> list[Any]:
+            return mapper(functools.partial(on_one_thread, task), names)
+
+        benchmark = run_benchmark(test_set, context, settings, lpips, mapped)
         details = {
             "set": test_set.name,
             "lpips": NO_RECORD if weights is None else weights.record,
@@ -150,24 +152,11 @@ def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: 
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
 
 
-def _make_recordings(options: argparse.Namespace, root: Path, work: Path, cleaning: Cleaning) -> list[str]:
-    try:
-        return make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
-    except ValueError as error:
-        raise ValueError(f"--recordings {error}") from error
-
-
 def _rotating_events(config: Config, work: Path) -> Path:
     """Emulate the scenes behind a rotating polarizer; returns the path of the events."""
     events, mapper = work / "rotating.zarr", config.mapper("emulate_rotating")
     emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
     return events
-
-
-def _on_one_thread_each(config: Config) -> Callable[[Callable[[str], Any], Sequence[str]], list[Any]]:
-    """The map of the benchmark's sequences over processes, each of which uses one thread."""
-    mapper = config.mapper("benchmark")
-    return lambda task, names: mapper(functools.partial(on_one_thread, task), names)
 
 
 def _train_mean(config: Config) -> float | None:

@@ -13,11 +13,9 @@ Command: TypeAlias = argparse.ArgumentParser
 AddCommand: TypeAlias = Callable[..., Command]
 """`_command` without its first argument."""
 
-PHOTOGRAPHS = ("astronaut", "chelsea", "coffee", "motorcycle_left")
-"""Photographs of scikit-image that fill the sensor with colour."""
 BESIDE = ""
 """Value of --truth without a path."""
-HELP_WIDTH = 100
+_wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
 
 
 def command_parser() -> argparse.ArgumentParser:
@@ -35,14 +33,17 @@ def command_parser() -> argparse.ArgumentParser:
 
 
 def _command(
-    commands: "argparse._SubParsersAction[Command]", name: str, run: str, summary: str, description: str, *examples: str
+    commands: "argparse._SubParsersAction[Command]",
+    name: str,
+    run: str,
+    summary: str,
+    *examples: str,
+    description: str = "",
 ) -> Command:
     command = commands.add_parser(
         name,
         help=summary,
-        description="\n".join(
-            textwrap.fill(line, HELP_WIDTH, subsequent_indent="  ") for line in description.split("\n")
-        ),
+        description="\n".join(map(_wrapped, description.split("\n"))),
         epilog="\n  ".join(["examples:", *(f"polarnet {example}" for example in examples)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -55,26 +56,18 @@ def _project(command: AddCommand) -> None:
         "demo",
         "simulate.demo",
         "a first result in a minute: simulate a built-in photograph and recover its DoLP",
-        "Simulates a camera with four polarizers that moves over a photograph of scikit-image, and recovers DoLP and "
-        "AoLP from its events with the shipped weights. Trains nothing and downloads nothing. `polarnet simulate` and "
-        "`polarnet recover` do the two halves, on files of your own.",
-        "demo --photograph coffee sensor=noisy",
+        "demo sensor=noisy",
+        description="Simulates a camera with four polarizers that moves over a photograph, and recovers DoLP and AoLP "
+        "from its events with the shipped weights. `polarnet simulate` and `polarnet recover` do the halves, on your "
+        "own files.",
     )
-    demo.add_argument("--photograph", choices=PHOTOGRAPHS, default=PHOTOGRAPHS[0], help="default: astronaut")
     demo.add_argument("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")
     _overrides(demo)
-    command(
-        "doctor",
-        "doctor.doctor",
-        "report versions, device, weights, extras, memory and disk",
-        "",
-        "doctor",
-    )
+    command("doctor", "doctor.doctor", "report versions, device, weights, extras, memory and disk", "doctor")
     preset = command(
         "preset",
         "project.preset",
-        "write a named experiment or sensor into params.yaml, keeping comments",
-        "",
+        "write a named experiment or sensor into params.yaml",
         "preset smoke",
     )
     preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
@@ -82,9 +75,9 @@ def _project(command: AddCommand) -> None:
         "new",
         "project.new",
         "write a project with the pipeline: dvc.yaml, params.yaml, conf, stages",
-        "Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages run again "
-        "after a change of requirements.txt, which names polarnet's version.",
         "new lake && cd lake && polarnet preset smoke && dvc repro",
+        description="Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages "
+        "run again after a change of requirements.txt, which names polarnet's version.",
     )
     new.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
 
@@ -94,8 +87,8 @@ def _stores(command: AddCommand) -> None:
         "view",
         "stores.view",
         "look at a store, a recording or a recovery in a page that plays it",
-        "Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
         "view data/frames.zarr --sequence lake-00",
+        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
     )
     view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
     view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
@@ -106,7 +99,6 @@ def _stores(command: AddCommand) -> None:
         "verify",
         "stores.verify",
         "check every byte of a store, a checkpoint or a data folder",
-        "",
         "verify data/events.zarr",
     )
     verify.add_argument("store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or folder")
@@ -114,10 +106,11 @@ def _stores(command: AddCommand) -> None:
         "video",
         "stores.video",
         "draw a stored sequence and its truth as a video that browsers play",
-        "Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and polarization (hue, "
-        "saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws predictions.",
         "video outputs/simulate/lake/events.zarr",
         "video data/events.zarr lake-0 --out lake.mp4",
+        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
+        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
+        "predictions.",
     )
     video.add_argument("store", help="event store: folder or fsspec URL")
     video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
@@ -127,9 +120,9 @@ def _stores(command: AddCommand) -> None:
         "replay",
         "stores.replay",
         "print a stored sequence as lines `t x y p angle`, at its own pace",
-        "Prints the events of a stored sequence at the pace of the recording. Pipe them into `polarnet recover - "
-        "--live` to try live recovery without a camera.",
         "replay data/events.zarr lake-0 --speed 0.5",
+        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into `polarnet "
+        "recover - --live` to try live recovery without a camera.",
     )
     replay.add_argument("store", help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
@@ -141,17 +134,17 @@ def _simulate(command: AddCommand) -> None:
         "simulate",
         "simulate.simulate",
         "make polarization events from a photograph, a video or measured polarization",
-        """\
+        "simulate lake.jpg sensor=noisy synthesize.duration_s=2",
+        "simulate walk.mp4 --size 240 320 --upsample --format store evt3",
+        "simulate frames/ --fps 100 polarizers=micropolarizers readout.max_events_per_s=5e6",
+        'simulate dofp.mp4 --mosaic "90 45 / 135 0" --out outputs/dofp',
+        description="""\
 Makes the events of a camera with four polarizers, the true DoLP and AoLP, and a preview video. INPUT is one of:
 - a photograph, or one measurement of polarization: a sensor moves over it (sections ingest and synthesize)
 - a video, or a folder of frames: hue becomes AoLP, saturation DoLP and value S0; the pixels see those of the frames
 - four videos behind polarizers, NAME_0.mp4 ... NAME_135.mp4, or a folder of frames NAME_0, NAME_45, NAME_90, NAME_135
 - with --mosaic: a video or a folder of raw frames of a polarization camera
 Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor=noisy polarizers=film seed=2.""",
-        "simulate lake.jpg sensor=noisy synthesize.duration_s=2",
-        "simulate walk.mp4 --size 240 320 --upsample --format store evt3",
-        "simulate frames/ --fps 100 polarizers=micropolarizers readout.max_events_per_s=5e6",
-        'simulate dofp.mp4 --mosaic "90 45 / 135 0" --out outputs/dofp',
     )
     simulate.set_defaults(overrides=[])
     add = simulate.add_argument
@@ -179,10 +172,10 @@ def _inspect(command: AddCommand) -> None:
         "inspect",
         "stores.inspect",
         "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
-        "Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a camera's file, "
-        "with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs. Of a store it names "
-        "the sequences.",
         "inspect recording.aedat4",
+        description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
+        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs. Of a "
+        "store it names the sequences.",
     )
     inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
     _reading(inspect)
@@ -195,7 +188,13 @@ def _recover(command: AddCommand) -> None:
         "recover",
         "recover.run",
         "recover DoLP and AoLP from recordings or from a running camera",
-        """\
+        'recover recording.aedat4 --mosaic "90 45 / 135 0"',
+        "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
+        "recover outputs/simulate/lake/events.zarr --truth",
+        "recover data/events.zarr --sequence lake-0 --rate 2000 --write mp4",
+        "recover camera.raw --rotating 15",
+        'recover dv://camera --live --mosaic "90 45 / 135 0"',
+        description="""\
 Writes frames, pictures, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
@@ -205,12 +204,6 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera
 With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
-        'recover recording.aedat4 --mosaic "90 45 / 135 0"',
-        "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
-        "recover outputs/simulate/lake/events.zarr --truth",
-        "recover data/events.zarr --sequence lake-0 --rate 2000 --write mp4",
-        "recover camera.raw --rotating 15",
-        'recover dv://camera --live --mosaic "90 45 / 135 0"',
     )
     add = recover.add_argument
     add("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
@@ -254,11 +247,11 @@ def _convert(command: AddCommand) -> None:
         "convert",
         "convert.convert",
         "convert a recording or an event store to HDF5 (DSEC's layout), text or EVT3",
-        "Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its events, or "
-        "those of a time span. Times in OUT count from the start of the span. Of an event store without --part, writes "
-        "a folder with one file for each sequence and channel.",
         "convert recording.aedat4 first.h5 --start 500ms --stop 2s",
         "convert data/events.zarr exported --to evt3 --sequence lake-0",
+        description="Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its "
+        "events, or those of a time span. Times in OUT count from the start of the span. Of an event store without "
+        "--part, writes a folder with one file for each sequence and channel.",
     )
     add = convert.add_argument
     add("file", metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
@@ -276,10 +269,10 @@ def _fit_sensor(command: AddCommand) -> None:
         "fit-sensor",
         "fit_sensor.run",
         "fit the simulated sensor to a camera's recordings",
-        "Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot pixels of a "
-        "camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws a page that compares each "
-        "recording with its simulated twin. docs/fit-sensor.md says what to record.",
         "fit-sensor --name lab --static dark.raw --static-light 0 --moving walk.raw --frames frames/",
+        description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
+        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws a page that "
+        "compares each recording with its simulated twin. docs/fit-sensor.md says what to record.",
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
@@ -304,10 +297,10 @@ def _onnx(command: AddCommand) -> None:
         "onnx",
         "convert.onnx",
         "export a network as an ONNX file, checked with ONNX Runtime",
-        "The exported network takes the events of one window and a state, and returns DoLP and the new state; the "
-        "file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX Runtime "
-        "reproduces torch's outputs.",
         "onnx polarnet.onnx --height 260 --width 346",
+        description="The exported network takes the events of one window and a state, and returns DoLP and the new "
+        "state; the file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX "
+        "Runtime reproduces torch's outputs.",
     )
     add = onnx.add_argument
     add("file", type=Path, metavar="OUT.onnx", help="file to write")
@@ -321,13 +314,13 @@ def _benchmark(command: AddCommand) -> None:
         "benchmark",
         "benchmark.run",
         "score every method on your own scenes or recordings, or study event budget and sensitivity",
-        "--scenes simulates event sequences from the pictures of a folder, runs every method whose weights are "
-        "available, prints the table and writes it with a page; it trains nothing. --recordings does the same on "
-        "recordings of a camera with a polarizer mosaic that hold frames. --event-budget and --sensitivity study the "
-        "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
         "benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours",
         "benchmark --recordings pdavis/ --hot-pixels found",
         "benchmark --event-budget --limit 4",
+        description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
+        "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same on "
+        "recordings of a camera with a polarizer mosaic that hold frames. --event-budget and --sensitivity study the "
+        "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True).add_argument
     asked("--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included")

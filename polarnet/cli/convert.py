@@ -22,10 +22,11 @@ SUFFIXES = {".h5": "hdf5", ".hdf5": "hdf5", ".txt": "text", ".raw": "evt3"}
 def convert(options: argparse.Namespace) -> None:
     """Convert a recording, or the sequences of an event store."""
     if options.part is None and is_store(options.file):
-        return _convert_store(options)
-    if options.sequence:
+        _convert_store(options)
+    elif options.sequence:
         raise ValueError("--sequence: expected an event store without --part; leave it out")
-    return _convert_recording(options, Path(options.file))
+    else:
+        _convert_recording(options, Path(options.file))
 
 
 def _convert_store(options: argparse.Namespace) -> None:

@@ -11,7 +11,6 @@ from polarnet.recordings.noise import FOUND, Cleaning
 READING = ("format", "height", "width", "clock_mhz")
 """Options that describe a camera's file where the file itself does not."""
 CLEANING = ("hot_pixels", "background")
-"""Options that remove noise."""
 HOT_FACTOR = 4.0
 """A pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
 

@@ -45,15 +45,9 @@ def run(options: argparse.Namespace) -> None:
     config = load(settings_root(), [f"runtime.device={options.device}"])
     setup = functools.partial(setup_of, config)
     source, rotation, rule = _rotating(options)
-    chosen = ChosenMethod(
-        options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD),
-        options.weights,
-        options.precision,
-        options.thresholds,
-        options.binning,
-        rotation,
-    )
-    recoverer, words = open_method(chosen, setup)
+    method = options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD)
+    settings = options.weights, options.precision, options.thresholds, options.binning, rotation
+    recoverer, words = open_method(ChosenMethod(method, *settings), setup)
     rate = None
     if options.rate is not None:
         check_rate(options.rate, rule, recoverer)
@@ -115,15 +109,10 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
         source = open_live(options.input[0], mosaic, options.idle)
         return source._replace(pieces=cleaner.live(source.pieces))
     method = METHODS.get(options.method)
-    files = Files(
-        [Path(path) for path in options.input],
-        options.angles,
-        mosaic,
-        options.sequence,
-        method is not None and method.reconstructs and method.wraps is None,  # NAME+gain needs four channels
-        functools.partial(read_recording, **reading_of(options)),
-        config.recordings,
-    )
+    plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
+    read = functools.partial(read_recording, **reading_of(options))
+    paths = [Path(path) for path in options.input]
+    files = Files(paths, options.angles, mosaic, options.sequence, plain, read, config.recordings)
     return open_files(files, work, options.size, cleaner)
 
 

@@ -27,13 +27,15 @@ from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.exchange import h5py_module
 
+PHOTOGRAPH = "astronaut"
+
 
 def demo(options: argparse.Namespace) -> int:
     """Simulate a built-in photograph and recover it with the shipped weights; returns the exit status."""
     from polarnet.cli import main
 
     started = time.monotonic()
-    photograph = next(photo.path for photo in BUILTIN_PHOTOS if photo.path.stem == options.photograph)
+    photograph = next(photo.path for photo in BUILTIN_PHOTOS if photo.path.stem == PHOTOGRAPH)
     simulated, recovered = (options.out.resolve() / name for name in ("simulated", "recovered"))
     print(f"simulating {photograph.name}; the first run also compiles the simulation")
     status = main(["simulate", str(photograph), *options.overrides, "--out", str(simulated)])

@@ -28,12 +28,7 @@ from polarnet.terminal.progress import ProgressBar
 STORE = "store"
 FORMATS = (STORE, *FORMS)
 EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", APPENDED, "preview.mp4", "preview.png", "spool"
-TRUTH_CONVENTIONS = {
-    "t_us": CONVENTIONS["t_us"],
-    "s0": "S0 = I0 + I90: value / 65535",
-    "dolp": CONVENTIONS["dolp"],
-    "aolp": CONVENTIONS["aolp"],
-}
+TRUTH_CONVENTIONS = {**CONVENTIONS, "s0": "S0 = I0 + I90: value / 65535"}
 COLUMNS: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
 
 
@@ -41,14 +36,10 @@ class Output(NamedTuple):
     """What to write."""
 
     folder: Path
-    name: str
-    """Name of the sequence."""
-    formats: Sequence[str]
-    """Some of `FORMATS`."""
-    gamma: float | None
-    """Gamma of S0 in the preview; None: no preview."""
-    attributes: dict[str, Any]
-    """Those of the event store."""
+    name: str  # of the sequence
+    formats: Sequence[str]  # some of FORMATS
+    gamma: float | None  # of S0 in the preview; None: no preview
+    attributes: dict[str, Any]  # of the event store
 
 
 class EventSpool:

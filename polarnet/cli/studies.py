@@ -51,8 +51,7 @@ def run_event_budget(
 ) -> dict[str, Any]:
     """Write event_budget.json, event_budget.png and the paper's Fig. 11 (.png, .pdf) of one sequence a set to `out`.
 
-    Fig. 11 is drawn of the simulated set and, if they are enabled, of the real targets. ValueError if `ours` has no
-    weights.
+    ValueError if `ours` has no weights.
     """
     stored, context = _prepared(config, [*dict.fromkeys([*methods, "ours"])], limit, weights)
     if reason := why_left_out("ours", context):
@@ -61,11 +60,11 @@ def run_event_budget(
     used = from_attributes(stored.events.attributes, stored.events.height, stored.events.width)
     conditions = announced(used, metadata_used(methods, context), SET_THEM)
     end_us = min(stored.scenes.duration_us(name) for name in stored.names)
+    window_us = round(1e6 / config.synthesize.frame_rate_hz)
     settle_us = round(config.benchmark.warmup_windows * 1e6 / config.synthesize.frame_rate_hz)
     lengths = [length for length in WINDOW_LENGTHS_US if settle_us + length <= end_us]
     first = min(end_us // 2, end_us - SPACING_US)
     times_us = range(first, min(first + SLIDING_FRAMES * SPACING_US, end_us) + 1, SPACING_US)
-    window_us = round(1e6 / config.synthesize.frame_rate_hz)
     results = {
         "methods": list(methods),
         "sequences": list(stored.names),
@@ -75,10 +74,8 @@ def run_event_budget(
         "sliding": by_sliding_window(stored, times_us, recoverer),
         "between": between_windows(stored, times_us, window_us, recoverer, config.between),
     }
-    for name in set_names(config):
-        if name in EXPERIMENTS:
-            test_set = pipeline_set(config, name)
-            _write_figure_11(out, name, test_set.sequence(test_set.sequences[0]), recoverer)
+    for test_set in (pipeline_set(config, name) for name in set_names(config) if name in EXPERIMENTS):
+        _write_figure_11(out, test_set.name, test_set.sequence(test_set.sequences[0]), recoverer)
     return _written(out, "event_budget", results, png(event_budget_figure(results)))
 
 
