@@ -1,6 +1,7 @@
 """`polarnet doctor`: versions, device and resources of this machine that matter to polarnet."""
 
 import argparse
+import functools
 import platform
 import shutil
 from collections.abc import Callable, Iterator
@@ -37,7 +38,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "threads", f"{usable_cores()} cores, torch uses {torch.get_num_threads()}"
     yield "bf16", units or "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
     for backbone in BACKBONES:
-        yield "LPIPS", _or_error(lambda backbone=backbone: f"{backbone}: {local_source(backbone, None)}")
+        yield "LPIPS", _or_error(functools.partial(_lpips, backbone))
     yield "weights", _or_error(_shipped)
     for extra, task in EXTRAS.items():
         yield "extra", f"{extra} ({task}): {_extra(extra)}"
@@ -50,6 +51,10 @@ def _or_error(finding: Callable[[], str]) -> str:
         return finding()
     except (ValueError, FileNotFoundError) as error:
         return str(error)
+
+
+def _lpips(backbone: str) -> str:
+    return f"{backbone}: {local_source(backbone, None)}"
 
 
 def _shipped() -> str:

@@ -1,7 +1,6 @@
 """`polarnet fit-sensor`: fit the simulated sensor to a camera's recordings."""
 
 import argparse
-import functools
 import re
 from pathlib import Path
 
@@ -40,9 +39,12 @@ def run(options: argparse.Namespace) -> None:
     """Fit, print the table, and write the sensor and the page."""
     check_options(options)
     preset = _preset_path(options.name)
-    read = functools.partial(read_recording, part=options.part, **reading_of(options))
-    static = read(options.static).events if options.static else None
-    moving = read(options.moving).events if options.moving else None
+
+    def read(path: Path) -> Events:
+        return read_recording(path, part=options.part, **reading_of(options)).events
+
+    static = read(options.static) if options.static else None
+    moving = read(options.moving) if options.moving else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
     known: list[KnownLight] = []
     lights: list[tuple[str, Events, MovingLight | Flicker | float]] = []
@@ -53,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
         lights.append((f"moving: {options.moving.name}", moving, known[-1].light))
     for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
         flicker = Flicker(options.flicker_light, options.contrast, frequency_hz)
-        known.append(KnownLight(f"flicker {frequency_hz:g} Hz", read(path).events, flicker))
+        known.append(KnownLight(f"flicker {frequency_hz:g} Hz", read(path), flicker))
         lights.append((f"flicker: {path.name}", known[-1].events, flicker))
     fit = fit_sensor(static, static_light, known, [moving] if moving is not None and not options.frames else [])
     notes = list(fit.notes)

@@ -60,7 +60,8 @@ class EventSpool:
 
     def channels(self) -> list[Events]:
         """All events so far; their columns stay on disk until they are used."""
-        return [Events(*(self._column(k, name) for name in COLUMNS), *size) for k, size in enumerate(self._sizes)]
+        columns = [{name: self._column(k, name) for name in COLUMNS} for k in range(len(self._sizes))]
+        return [Events(**one, height=h, width=w) for one, (h, w) in zip(columns, self._sizes, strict=True)]
 
     def _column(self, channel: int, name: str) -> Tensor:
         file, dtype = self.folder / f"{channel}.{name}", COLUMNS[name]
