@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
@@ -20,7 +19,7 @@ from polarnet.config.tree import load
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
 from polarnet.methods.intensities import consistent
-from polarnet.reports.figures import LIGHT, chart_style, show_picture
+from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
 from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_out, weights_of
 from polarnet.simulation.emulator import EmulatorConfig, emulate
@@ -39,7 +38,7 @@ from polarnet.stokes import (
     stokes_from_polarization,
 )
 from studies.overview import OFF, ON
-from studies.simulation_pictures import LINE, QUIET, photograph, write_pictures
+from studies.simulation_pictures import LINE, QUIET, drawn, photograph, write_pictures
 from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
@@ -65,17 +64,12 @@ def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, 
     return events
 
 
-def pixel_figure() -> Figure:
+@drawn(9.0, 5.4)
+def pixel_figure(figure: Figure) -> None:
     """Draw a pixel's physics, from its light to its events."""
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 5.4), layout="constrained", facecolor=LIGHT.face)
-        for axes, draw in zip(
-            figure.subplots(2, 3).ravel(),
-            (_draw_response, _draw_photoreceptor, _draw_mismatch, _draw_noise, _draw_refractory, _draw_bit_depth),
-            strict=True,
-        ):
-            draw(axes)
-    return figure
+    draws = (_draw_response, _draw_photoreceptor, _draw_mismatch, _draw_noise, _draw_refractory, _draw_bit_depth)
+    for axes, draw in zip(figure.subplots(2, 3).ravel(), draws, strict=True):
+        draw(axes)
 
 
 def _draw_response(axes: Axes) -> None:
@@ -179,28 +173,24 @@ def _draw_bit_depth(axes: Axes) -> None:
     axes.set_title("ramp from 10 to 40 DN, threshold 0.05", loc="left", fontsize=9)
 
 
-def polarizers_figure() -> Figure:
+@drawn(9.0, 2.7)
+def polarizers_figure(figure: Figure) -> None:
     """Draw Malus' law for each preset, and a picture through the mosaic of a DoFP sensor."""
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 2.7), layout="constrained", facecolor=LIGHT.face)
-        curves, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.05))[0]
-        for part in (curves, right):
-            part.set_facecolor(LIGHT.face)
-        axes = curves.subplots()
-        angles = np.radians(np.linspace(-90, 90, 361))
-        for (name, polarizers), colour in zip(POLARIZERS.items(), COLOURS, strict=True):
-            weights = weights_of(replace(polarizers, angle_error_deg=[0.0] * 4), 1, 1, 0)[0].astype(np.float64)
-            through = weights @ np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
-            axes.semilogy(np.degrees(angles), through.clip(1e-6), color=colour, linewidth=1.4,
-                          label=name.replace("_", " "))  # fmt: skip
-        axes.set(
-            xlabel="angle between light and axis, degrees", ylabel="transmission", ylim=(1e-4, 1.5), xlim=(-90, 90)
-        )
-        axes.set_xticks(range(-90, 91, 45))
-        axes.legend(fontsize=8, frameon=False, loc="lower center")
-        axes.set_title("fully polarized light, without crosstalk", loc="left", fontsize=9)
-        _draw_mosaic(right, POLARIZERS["micropolarizers"])
-    return figure
+    curves, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.05))[0]
+    for part in (curves, right):
+        part.set_facecolor(LIGHT.face)
+    axes = curves.subplots()
+    angles = np.radians(np.linspace(-90, 90, 361))
+    for (name, polarizers), colour in zip(POLARIZERS.items(), COLOURS, strict=True):
+        weights = weights_of(replace(polarizers, angle_error_deg=[0.0] * 4), 1, 1, 0)[0].astype(np.float64)
+        through = weights @ np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
+        axes.semilogy(np.degrees(angles), through.clip(1e-6), color=colour, linewidth=1.4,
+                      label=name.replace("_", " "))  # fmt: skip
+    axes.set(xlabel="angle between light and axis, degrees", ylabel="transmission", ylim=(1e-4, 1.5), xlim=(-90, 90))
+    axes.set_xticks(range(-90, 91, 45))
+    axes.legend(fontsize=8, frameon=False, loc="lower center")
+    axes.set_title("fully polarized light, without crosstalk", loc="left", fontsize=9)
+    _draw_mosaic(right, POLARIZERS["micropolarizers"])
 
 
 def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
@@ -232,49 +222,43 @@ def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:
     return scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
 
 
-def readout_figure() -> Figure:
+@drawn(9.0, 2.8)
+def readout_figure(figure: Figure) -> None:
     """Draw the times of a flash by row, and a bus whose limit the events exceed."""
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 2.8), layout="constrained", facecolor=LIGHT.face)
-        rows, rate, waits = figure.subplots(1, 3)
-        flash = _flash()
-        for readout, colour, label in (
-            (PERFECT, LIGHT.quiet, "perfect"),
-            (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
-            (replace(PERFECT, max_events_per_s=1e6, max_wait_us=1500.0), ON, "1 Mev/s, wait 1.5 ms"),
-        ):
-            events, _ = read_out(flash, readout, key=1, duration_us=30_000)
-            rows.plot(events.t.numpy() / 1000, events.y.numpy(), ".", color=colour, markersize=1.2, label=label)
-        rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
-        rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
-        rows.set_title("a flash on 60 rows", loc="left", fontsize=9)
-        swing = _swing()
-        limit_hz = 1e5
-        limited, lost = read_out(
-            swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
-        )
-        for events, colour, label in ((swing, LIGHT.quiet, "of the pixels"), (limited, ON, "read out")):
-            counts = np.bincount(events.t.numpy() // 5_000, minlength=200)[:200]
-            rate.step(
-                np.arange(200) * 5e-3, counts * 200 / 1000, where="post", color=colour, linewidth=1.2, label=label
-            )
-        rate.set(xlabel="s", ylabel="kev/s", xlim=(0, 1), ylim=(0, None))
-        rate.legend(fontsize=7, frameon=False)
-        rate.set_title(f"limit {limit_hz / 1000:g} kev/s: {lost / len(swing):.0%} lost", loc="left", fontsize=9)
-        offered = np.linspace(0.1, 2.5, 25)
-        for wait_us, colour in zip((200.0, 5_000.0), (COLOURS[1], COLOURS[3]), strict=True):
-            shares = [
-                read_out(swing, replace(PERFECT, max_events_per_s=len(swing) / load, max_wait_us=wait_us), key=1,
-                         duration_us=1_000_000)[1] / len(swing) for load in offered
-            ]  # fmt: skip
-            waits.plot(offered, shares, color=colour, linewidth=1.4, label=f"wait up to {wait_us / 1000:g} ms")
-        waits.plot(
-            offered, np.maximum(0, 1 - 1 / offered), color=LIGHT.quiet, linewidth=1, label="steady rate: 1 - 1/load"
-        )
-        waits.set(xlabel="mean rate / limit", ylabel="events lost", ylim=(0, None))
-        waits.legend(fontsize=7, frameon=False)
-        waits.set_title("loss against load", loc="left", fontsize=9)
-    return figure
+    rows, rate, waits = figure.subplots(1, 3)
+    flash = _flash()
+    for readout, colour, label in (
+        (PERFECT, LIGHT.quiet, "perfect"),
+        (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
+        (replace(PERFECT, max_events_per_s=1e6, max_wait_us=1500.0), ON, "1 Mev/s, wait 1.5 ms"),
+    ):
+        events, _ = read_out(flash, readout, key=1, duration_us=30_000)
+        rows.plot(events.t.numpy() / 1000, events.y.numpy(), ".", color=colour, markersize=1.2, label=label)
+    rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
+    rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
+    rows.set_title("a flash on 60 rows", loc="left", fontsize=9)
+    swing = _swing()
+    limit_hz = 1e5
+    limited, lost = read_out(
+        swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
+    )
+    for events, colour, label in ((swing, LIGHT.quiet, "of the pixels"), (limited, ON, "read out")):
+        counts = np.bincount(events.t.numpy() // 5_000, minlength=200)[:200]
+        rate.step(np.arange(200) * 5e-3, counts * 200 / 1000, where="post", color=colour, linewidth=1.2, label=label)
+    rate.set(xlabel="s", ylabel="kev/s", xlim=(0, 1), ylim=(0, None))
+    rate.legend(fontsize=7, frameon=False)
+    rate.set_title(f"limit {limit_hz / 1000:g} kev/s: {lost / len(swing):.0%} lost", loc="left", fontsize=9)
+    offered = np.linspace(0.1, 2.5, 25)
+    for wait_us, colour in zip((200.0, 5_000.0), (COLOURS[1], COLOURS[3]), strict=True):
+        shares = [
+            read_out(swing, replace(PERFECT, max_events_per_s=len(swing) / load, max_wait_us=wait_us), key=1,
+                     duration_us=1_000_000)[1] / len(swing) for load in offered
+        ]  # fmt: skip
+        waits.plot(offered, shares, color=colour, linewidth=1.4, label=f"wait up to {wait_us / 1000:g} ms")
+    waits.plot(offered, np.maximum(0, 1 - 1 / offered), color=LIGHT.quiet, linewidth=1, label="steady rate: 1 - 1/load")
+    waits.set(xlabel="mean rate / limit", ylabel="events lost", ylim=(0, None))
+    waits.legend(fontsize=7, frameon=False)
+    waits.set_title("loss against load", loc="left", fontsize=9)
 
 
 def _flash() -> Events:
@@ -316,7 +300,8 @@ def events_per_frame(config: EmulatorConfig, speed_px_s: float, duration_s: floa
     return np.diff(np.searchsorted(events.t.numpy(), edges_us))[SETTLING_FRAMES:]
 
 
-def rate_figure() -> Figure:
+@drawn(9.0, 2.6)
+def rate_figure(figure: Figure) -> None:
     """Draw events per frame at constant speed over a pattern that repeats."""
     settings: Mapping[str, tuple[str, float | None]] = {
         "exact, a frame of light for each pixel of motion": ("exact", None),
@@ -324,35 +309,28 @@ def rate_figure() -> Figure:
         "v2e, 300 frames of light a second": ("v2e", 300.0),
         "v2e, a frame of light for each pixel of motion": ("v2e", None),
     }
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 2.6), layout="constrained", facecolor=LIGHT.face)
-        axes = figure.subplots()
-        for (label, (model, rate_hz)), colour in zip(settings.items(), COLOURS, strict=True):
-            counts = events_per_frame(replace(QUIET, model=model, render_rate_hz=rate_hz), CONSTANT_SPEED_PX_S)
-            spread = counts.std() / counts.mean()
-            axes.plot(counts / counts.mean(), ".-", color=colour, linewidth=1, markersize=4,
-                      label=f"{label}: {spread:.1%} RMS")  # fmt: skip
-        axes.legend(fontsize=7, frameon=False, ncols=2, loc="upper center")
-        axes.set(xlabel="frame (30 a second)", ylabel="events / mean", ylim=(0.75, 1.4))
-        axes.set_title(f"{CONSTANT_SPEED_PX_S:g} px/s over a pattern", loc="left", fontsize=9)
-    return figure
+    axes = figure.subplots()
+    for (label, (model, rate_hz)), colour in zip(settings.items(), COLOURS, strict=True):
+        counts = events_per_frame(replace(QUIET, model=model, render_rate_hz=rate_hz), CONSTANT_SPEED_PX_S)
+        spread = counts.std() / counts.mean()
+        axes.plot(counts / counts.mean(), ".-", color=colour, linewidth=1, markersize=4,
+                  label=f"{label}: {spread:.1%} RMS")  # fmt: skip
+    axes.legend(fontsize=7, frameon=False, ncols=2, loc="upper center")
+    axes.set(xlabel="frame (30 a second)", ylabel="events / mean", ylim=(0.75, 1.4))
+    axes.set_title(f"{CONSTANT_SPEED_PX_S:g} px/s over a pattern", loc="left", fontsize=9)
 
 
-def malus_figure() -> Figure:
+@drawn(6.4, 3.0)
+def malus_figure(figure: Figure) -> None:
     """Draw intensity behind a polarizer against its angle, with the four measured angles marked."""
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(6.4, 3.0), layout="constrained", facecolor=LIGHT.face)
-        axes = figure.subplots()
-        for degree, colour in zip(DEGREES, (*COLOURS[:2], COLOURS[3]), strict=True):
-            axes.plot(
-                range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}"
-            )
-            marked = [_behind(degree, angle) for angle in POLARIZER_ANGLES_DEG]
-            axes.plot(POLARIZER_ANGLES_DEG, marked, "o", color=colour)
-        axes.axvline(AOLP_DEG, color=LIGHT.quiet, linestyle=":", label=f"AoLP {AOLP_DEG:g}°")
-        axes.set(xlabel="angle of the polarizer, degrees", ylabel="intensity / S0", xticks=range(0, 181, 45))
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    return figure
+    axes = figure.subplots()
+    for degree, colour in zip(DEGREES, (*COLOURS[:2], COLOURS[3]), strict=True):
+        axes.plot(range(181), [_behind(degree, angle) for angle in range(181)], color=colour, label=f"DoLP {degree:g}")
+        marked = [_behind(degree, angle) for angle in POLARIZER_ANGLES_DEG]
+        axes.plot(POLARIZER_ANGLES_DEG, marked, "o", color=colour)
+    axes.axvline(AOLP_DEG, color=LIGHT.quiet, linestyle=":", label=f"AoLP {AOLP_DEG:g}°")
+    axes.set(xlabel="angle of the polarizer, degrees", ylabel="intensity / S0", xticks=range(0, 181, 45))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
 
 
 def _behind(degree: float, angle_deg: float) -> float:
@@ -361,7 +339,8 @@ def _behind(degree: float, angle_deg: float) -> float:
     return float(intensity_behind_polarizer(stokes, math.radians(angle_deg)))
 
 
-def gains_figure() -> Figure:
+@drawn(7.2, 2.0)
+def gains_figure(figure: Figure) -> None:
     """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
     truth = true_stokes(photograph())
     noise = 1 + NOISE * torch.randn((4, *truth.shape[1:]), generator=torch.Generator().manual_seed(1))
@@ -369,13 +348,10 @@ def gains_figure() -> Figure:
     wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]
     solved = consistent(wrong[None], load(ROOT).methods.gain)[0]
     panels = {"true": dolp(truth), "factors unknown": _dolp_of(wrong), "factors solved": _dolp_of(solved)}
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(7.2, 2.0), layout="constrained", facecolor=LIGHT.face)
-        for axes, (name, degree) in zip(figure.subplots(1, 3), panels.items(), strict=True):
-            show_picture(axes, dolp_image(degree), LIGHT)
-            rms = float((degree.clamp(0, 1) - panels["true"]).square().mean().sqrt())
-            axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
-    return figure
+    for axes, (name, degree) in zip(figure.subplots(1, 3), panels.items(), strict=True):
+        show_picture(axes, dolp_image(degree), LIGHT)
+        rms = float((degree.clamp(0, 1) - panels["true"]).square().mean().sqrt())
+        axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
 
 
 def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:

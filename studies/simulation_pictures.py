@@ -85,6 +85,21 @@ SETTINGS: Mapping[str, dict[str, Any]] = {
 """Tiles of the window picture: the changes of each to a noiseless `exact` pixel."""
 
 
+def drawn(width: float, height: float) -> Callable[[Callable[[Figure], None]], Callable[[], Figure]]:
+    """Decorator: `draw(figure)` becomes a function that returns the figure, in the style of docs; sizes in inches."""
+
+    def of(draw: Callable[[Figure], None]) -> Callable[[], Figure]:
+        def make() -> Figure:
+            with matplotlib.rc_context(chart_style(LIGHT)):
+                figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
+                draw(figure)
+            return figure
+
+        return make
+
+    return of
+
+
 def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Light on one pixel in digital numbers: a slow swell, a quick flash, then steady dim light."""
     swell = 0.7 * (1 - np.cos(2 * math.pi * t_ms.clip(0, 180) / 180)) / 2
@@ -104,80 +119,73 @@ def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int =
     return events
 
 
-def parameters_figure() -> Figure:
+@drawn(9.0, 5.2)
+def parameters_figure(figure: Figure) -> None:
     """Draw one pixel's events for several values of each physical parameter."""
     t_ms = np.linspace(0, DURATION_MS, 2001)
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 5.2), layout="constrained", facecolor=LIGHT.face)
-        panels = figure.subplots(2, 3, sharex=True).ravel()
-        for axes, variation in zip(panels, VARIATIONS, strict=False):
-            _light(axes, t_ms, variation.title)
-            for row, value in enumerate(variation.values):
-                _ticks(axes, pixel_events(_with(QUIET, variation.name, value)), row)
-            off = "∞ Hz" if variation.name == "cutoff_hz" else f"0{variation.unit}"
-            _rows(axes, [f"{value:g}{variation.unit}" if value else off for value in variation.values])
-        _light(panels[-1], t_ms, "mismatch 0.05: twelve pixels, one light")
-        events = pixel_events(
-            replace(QUIET, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05), pixels=PIXELS
-        )
-        for pixel in range(PIXELS):
-            _ticks(panels[-1], _of_pixel(events, pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
-        panels[-1].set_yticks([])
-        for axes in panels[3:]:
-            axes.set_xlabel("ms")
-    return figure
+    panels = figure.subplots(2, 3, sharex=True).ravel()
+    for axes, variation in zip(panels, VARIATIONS, strict=False):
+        _light(axes, t_ms, variation.title)
+        for row, value in enumerate(variation.values):
+            _ticks(axes, pixel_events(_with(QUIET, variation.name, value)), row)
+        off = "∞ Hz" if variation.name == "cutoff_hz" else f"0{variation.unit}"
+        _rows(axes, [f"{value:g}{variation.unit}" if value else off for value in variation.values])
+    _light(panels[-1], t_ms, "mismatch 0.05: twelve pixels, one light")
+    events = pixel_events(
+        replace(QUIET, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05), pixels=PIXELS
+    )
+    for pixel in range(PIXELS):
+        _ticks(panels[-1], _of_pixel(events, pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
+    panels[-1].set_yticks([])
+    for axes in panels[3:]:
+        axes.set_xlabel("ms")
 
 
-def crossings_figure() -> Figure:
+@drawn(9.0, 2.9)
+def crossings_figure(figure: Figure) -> None:
     """Draw the threshold crossings of log intensity, and their times by `exact` and `v2e`, from frames at 60 Hz."""
     rate_hz, threshold = 60.0, QUIET.contrast_threshold_on
     frames_ms = np.arange(0, 200, 1000 / rate_hz)
     t_ms = np.linspace(0, frames_ms[-1], 2001)
     log = np.interp(t_ms, frames_ms, np.log(light_of_one_pixel(frames_ms)))
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 2.9), layout="constrained", facecolor=LIGHT.face)
-        curve, stamps = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-        curve.plot(t_ms, log, **LINE)
-        curve.plot(frames_ms, np.log(light_of_one_pixel(frames_ms)), "o", color=LIGHT.text, markersize=3)
-        events = slice_time(pixel_events(QUIET, rate_hz), 0, int(1000 * t_ms[-1]))
-        for t, p in zip(events.t.numpy() / 1000, events.p.numpy(), strict=True):
-            level = float(np.interp(t, t_ms, log))
-            curve.plot([0, t], [level, level], color=LIGHT.grid, linewidth=0.8, zorder=0)
-            curve.plot([t], [level], "^" if p > 0 else "v", color=ON if p > 0 else OFF, markersize=6)
-        curve.set_ylabel("ln light")
-        curve.set_title(
-            f"a step of {threshold:g} in log light is an event; dots: frames at 60 Hz", loc="left", fontsize=9
-        )
-        curve.grid(axis="y", visible=False)
-        for row, model in enumerate(("exact", "v2e")):
-            drawn_events = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
-            _ticks(stamps, drawn_events, row, 0.7)
-        stamps.set_yticks([0.35, 1.35], ["exact", "v2e"])
-        stamps.set(ylim=(1.9, -0.2), xlabel="ms", xlim=(0, t_ms[-1]))
-        stamps.grid(visible=False)
-    return figure
+    curve, stamps = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    curve.plot(t_ms, log, **LINE)
+    curve.plot(frames_ms, np.log(light_of_one_pixel(frames_ms)), "o", color=LIGHT.text, markersize=3)
+    events = slice_time(pixel_events(QUIET, rate_hz), 0, int(1000 * t_ms[-1]))
+    for t, p in zip(events.t.numpy() / 1000, events.p.numpy(), strict=True):
+        level = float(np.interp(t, t_ms, log))
+        curve.plot([0, t], [level, level], color=LIGHT.grid, linewidth=0.8, zorder=0)
+        curve.plot([t], [level], "^" if p > 0 else "v", color=ON if p > 0 else OFF, markersize=6)
+    curve.set_ylabel("ln light")
+    curve.set_title(f"a step of {threshold:g} in log light is an event; dots: frames at 60 Hz", loc="left", fontsize=9)
+    curve.grid(axis="y", visible=False)
+    for row, model in enumerate(("exact", "v2e")):
+        drawn_events = slice_time(pixel_events(replace(QUIET, model=model), rate_hz), 0, int(1000 * t_ms[-1]))
+        _ticks(stamps, drawn_events, row, 0.7)
+    stamps.set_yticks([0.35, 1.35], ["exact", "v2e"])
+    stamps.set(ylim=(1.9, -0.2), xlabel="ms", xlim=(0, t_ms[-1]))
+    stamps.grid(visible=False)
 
 
-def window_figure() -> Figure:
+@drawn(9.0, 5.1)
+def window_figure(figure: Figure) -> None:
     """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
     scene = photograph()
     motion = replace(MOTIONS["default"], sensor_height=100, sensor_width=150, speed_min_px_s=150.0)
     trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
     columns, rows = 4, 3
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 5.1), layout="constrained", facecolor=LIGHT.face)
-        panels = figure.subplots(rows, columns).ravel()
-        for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
-            config = replace(QUIET, **changes)
-            events = emulate_motion(Camera(config, key=1), scene, trajectory, WINDOW_US[1], (100, 150))[0]
-            window = slice_time(events, *WINDOW_US)
-            show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
-            axes.set_title(label, loc="left", fontsize=9)
-            axes.set_xlabel(f"{len(window):,} events", color=LIGHT.quiet, fontsize=7)
-    return figure
+    panels = figure.subplots(rows, columns).ravel()
+    for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
+        config = replace(QUIET, **changes)
+        events = emulate_motion(Camera(config, key=1), scene, trajectory, WINDOW_US[1], (100, 150))[0]
+        window = slice_time(events, *WINDOW_US)
+        show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
+        axes.set_title(label, loc="left", fontsize=9)
+        axes.set_xlabel(f"{len(window):,} events", color=LIGHT.quiet, fontsize=7)
 
 
-def motion_figure() -> Figure:
+@drawn(9.0, 1.75)
+def motion_figure(figure: Figure) -> None:
     """Draw the sensor's path over a picture for several values of the motion parameters."""
     picture = read_rgb(_photo()).permute(1, 2, 0).numpy()
     default = MOTIONS["default"]
@@ -189,15 +197,12 @@ def motion_figure() -> Figure:
         "rotation up to 40°": replace(default, rotation_max_deg=40.0),
         "zoom up to 2.5": replace(default, zoom_max=2.5),
     }
-    with matplotlib.rc_context(chart_style(LIGHT)):
-        figure = Figure(figsize=(9.0, 1.75), layout="constrained", facecolor=LIGHT.face)
-        for axes, (label, motion) in zip(figure.subplots(1, 4), motions.items(), strict=True):
-            show_picture(axes, picture[::2, ::2], LIGHT)
-            axes.images[0].set_extent((-0.5, picture.shape[1] - 0.5, picture.shape[0] - 0.5, -0.5))
-            trajectory = random_trajectory(motion, picture.shape[0], picture.shape[1], np.random.default_rng(4))
-            _way(axes, trajectory, motion)
-            axes.set_title(label, loc="left", fontsize=9)
-    return figure
+    for axes, (label, motion) in zip(figure.subplots(1, 4), motions.items(), strict=True):
+        show_picture(axes, picture[::2, ::2], LIGHT)
+        axes.images[0].set_extent((-0.5, picture.shape[1] - 0.5, picture.shape[0] - 0.5, -0.5))
+        trajectory = random_trajectory(motion, picture.shape[0], picture.shape[1], np.random.default_rng(4))
+        _way(axes, trajectory, motion)
+        axes.set_title(label, loc="left", fontsize=9)
 
 
 def _way(axes: Axes, trajectory: Trajectory, motion: SynthesizeConfig) -> None:

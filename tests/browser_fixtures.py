@@ -32,18 +32,14 @@ def opened(browser: Any, file: Path, width: int, scheme: str) -> Iterator[tuple[
     problems: list[str] = []
     page.on("console", lambda message: problems.append(f"console: {message.text}"))
     page.on("pageerror", lambda error: problems.append(f"error: {error}"))
-    page.on("request", lambda request: problems.extend(outside(request.url, file)))
+    inside = ("data:", "blob:", file.as_uri())
+    page.on("request", lambda one: problems.extend([] if one.url.startswith(inside) else [f"request: {one.url}"]))
     try:
         page.goto(file.as_uri())
         settle(page)
         yield page, problems
     finally:
         page.close()
-
-
-def outside(url: str, file: Path) -> list[str]:
-    """The problem of a request, if it leaves the page."""
-    return [] if url.startswith(("data:", "blob:", file.as_uri())) else [f"request: {url}"]
 
 
 def settle(page: Any) -> None:
@@ -54,7 +50,7 @@ def settle(page: Any) -> None:
     for chart in page.locator("[data-chart]").all():
         chart.scroll_into_view_if_needed()
     page.wait_for_function("[...document.querySelectorAll('[data-chart]')].every((one) => one.dataset.drawn)")
-    wait_for_player(page)
+    page.wait_for_function("[...document.querySelectorAll('.player')].every((one) => one.dataset.ready === 'yes')")
     page.evaluate("scrollTo(0, 0)")
 
 
@@ -63,11 +59,6 @@ def wear(page: Any, width: int, scheme: str) -> None:
     page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": width, "height": 900})
     page.wait_for_timeout(150)  # charts follow the width and the colours
-
-
-def wait_for_player(page: Any) -> None:
-    """Wait until the player, if there is one, shows its scene."""
-    page.wait_for_function("[...document.querySelectorAll('.player')].every((one) => one.dataset.ready === 'yes')")
 
 
 def cut_off(page: Any) -> list[str]:
@@ -80,19 +71,11 @@ def cut_off(page: Any) -> list[str]:
 
 
 def axe_serious(page: Any) -> list[str]:
-    """Serious and critical faults that axe-core finds, each with the first element."""
-    page.evaluate(_axe())
+    """Serious and critical faults that axe-core finds, each with the first element; needs axe-playwright-python."""
+    page.evaluate(Path(find_spec("axe_playwright_python").origin).with_name("axe.min.js").read_text(encoding="utf-8"))
     audit = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
     return [
         f"{fault['id']}: {fault['help']}: {fault['nodes'][0]['html'][:200]}"
         for fault in audit["violations"]
         if fault["impact"] in SERIOUS
     ]
-
-
-def _axe() -> str:
-    """axe-core, as the package axe-playwright-python ships it; RuntimeError without the package."""
-    spec = find_spec("axe_playwright_python")
-    if spec is None or spec.origin is None:
-        raise RuntimeError("axe-core is not installed: pip install axe-playwright-python")
-    return Path(spec.origin).with_name("axe.min.js").read_text(encoding="utf-8")

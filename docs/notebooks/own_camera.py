@@ -34,7 +34,7 @@ if recording is None:
 # The summary names format, size, rates and hot pixels.
 
 # %%
-assert main(["inspect", str(recording), "--picture", "busiest.png"]) == 0
+assert main(["inspect", str(recording), "--out", "pictures"]) == 0
 
 # %% [markdown]
 # ## Recover DoLP

@@ -1,11 +1,11 @@
-"""The `polarnet` command. Subcommands are thin: each imports the library when it runs and leaves the work to it."""
+"""The `polarnet` command. A command is a function of a module here, which is imported when the command runs."""
 
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
-from polarnet import __version__
-from polarnet.cli import benchmark, convert, demo, networks, new, project, recordings, sensors, simulate, stores
+from polarnet.cli.commands import command_parser
 from polarnet.terminal.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
 
 
@@ -13,20 +13,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     let_threads_sleep()
     silence_bindings()
-    options = _options(arguments)
+    options = parse(arguments)
+    module, _, function = options.run.partition(".")
     try:
-        return options.run(options)
+        status: int | None = getattr(import_module(f"polarnet.cli.{module}"), function)(options)
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
         print(f"polarnet {options.command}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
+    return status or 0
 
 
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """The arguments; words KEY=VALUE behind the options of a command with overrides count as overrides."""
-    parser, words = _parser(), sys.argv[1:] if arguments is None else arguments
+    parser, words = command_parser(), sys.argv[1:] if arguments is None else arguments
     if strange := [word for word in words if any("\ud800" <= character <= "\udfff" for character in word)]:
         parser.error(f"{strange[0]!a}: expected a name in UTF-8; rename the file")
     options, rest = parser.parse_known_args(words)
@@ -35,16 +37,3 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="polarnet",
-        description="Degree of linear polarization (DoLP) from event cameras: simulation, training, benchmark and "
-        "recovery. `dvc repro` runs the pipeline.",
-    )
-    parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for subject in (demo, project, new, stores, simulate, recordings, convert, sensors, networks, benchmark):
-        subject.add_to(commands)
-    return parser

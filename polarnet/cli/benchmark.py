@@ -1,98 +1,68 @@
-"""Command that scores methods on your own scenes or recordings, or studies the pipeline's event budget."""
+"""`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
+
+Pictures, scenes and events of a user's folder stay in `work` of the output, so that a stopped run resumes and a second
+run only runs the methods.
+"""
 
 import argparse
 import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+from polarnet.analysis.conditions import announced, configured
+from polarnet.analysis.recorded import make_recorded_set
+from polarnet.benchmark.results import write_benchmark
+from polarnet.benchmark.rows import available, metadata_used, weights_used
+from polarnet.benchmark.run import run_benchmark
+from polarnet.benchmark.sequences import train_mean_dolp
+from polarnet.cli.options import CLEANING, cleaning_of, given
 from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.cli.parsers import Commands, add_cleaning, cleaning_of
 from polarnet.cli.project import project_root, settings_root, working_folder
+from polarnet.cli.studies import STUDIED, run_event_budget
+from polarnet.config.pipeline import context_of, made_set
+from polarnet.config.tree import Config, load, with_lpips
+from polarnet.methods import is_rotating
+from polarnet.metrics.lpips import NO_RECORD, find_weights
+from polarnet.metrics.similarity import Lpips
+from polarnet.networks.weights import shipped_weights
+from polarnet.pictures.manifest import read_manifest
+from polarnet.recordings.noise import Cleaning
+from polarnet.reports.artefacts import read_results, results_table
+from polarnet.reports.page import write_set_page
+from polarnet.reports.tables import as_plain
+from polarnet.runtime.machine import configure, on_one_thread, usable_cores
+from polarnet.simulation.rotating import emulate_rotating_scenes
+from polarnet.simulation.sets import make_folder_set
+from polarnet.simulation.truth import motions_of
+from polarnet.stokes import parse_mosaic
+from polarnet.storage.frames import FrameStore
+from polarnet.storage.scenes import SceneStore
 
-if TYPE_CHECKING:
-    from polarnet.config.tree import Config
-    from polarnet.recordings.noise import Cleaning
-
-DESCRIPTION = """\
---scenes simulates event sequences from the pictures of a folder, runs every method whose weights are available,
-prints the table and writes it with a page; it trains nothing. --recordings does the same on recordings of a camera
-with a polarizer mosaic that hold frames. --event-budget studies the pipeline's own test sequences.
-params.yaml sets sizes, motion and sensor."""
-
-EXAMPLES = """\
-examples:
-  polarnet benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours
-  polarnet benchmark --recordings pdavis/ --hot-pixels found
-  polarnet benchmark --event-budget --limit 4"""
-
+SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
 PDAVIS = "90 45 / 135 0"
 PART = 2  # scenes
+NOT_ROTATING = "recordings hold the events of four channels, not those behind a rotating polarizer"
+RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarization is the truth."
 
 
-def add_to(commands: Commands) -> None:
-    """Add the command benchmark."""
-    benchmark = commands.add_parser(
-        "benchmark",
-        help="score every method on your own scenes or recordings, or study the event budget",
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    asked = benchmark.add_mutually_exclusive_group(required=True)
-    asked.add_argument(
-        "--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included"
-    )
-    asked.add_argument(
-        "--recordings",
-        type=Path,
-        metavar="FOLDER",
-        help="recordings with frames: HDF5 of E2P, AEDAT-2 and AEDAT4 of a DAVIS, subfolders included",
-    )
-    asked.add_argument("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
-    benchmark.add_argument(
-        "--weights",
-        type=Path,
-        metavar="FILE",
-        help="checkpoint of the network (default: the shipped one; for studies the pipeline's)",
-    )
-    benchmark.add_argument(
-        "--kind", choices=("auto", "photographs", "polarization"), default="auto",
-        help="content of FOLDER; auto recognises .npz files and NAME_0, NAME_45, ... as measured polarization "
-        "(default: auto)",
-    )  # fmt: skip
-    benchmark.add_argument(
-        "--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)"
-    )
-    add_cleaning(benchmark)
-    benchmark.add_argument("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
-    benchmark.add_argument(
-        "--methods", help="methods, separated by commas (default: benchmark.methods; studies have a list of their own)"
-    )
-    benchmark.add_argument(
-        "--limit", type=int, metavar="N", help="use only N pictures of --scenes, or N test sequences"
-    )
-    benchmark.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: seed=2")
-    benchmark.set_defaults(run=_benchmark)
-
-
-def _benchmark(options: argparse.Namespace) -> int:
-    from polarnet.config.tree import load
-    from polarnet.runtime.machine import configure, usable_cores
-
+def run(options: argparse.Namespace) -> None:
+    """Score methods on a folder or study the pipeline's sequences; print the table or the files."""
     own = options.scenes or options.recordings
     if options.recordings and options.limit is not None:
         raise ValueError("--limit does not apply to --recordings; leave it out")
     if options.limit is not None and options.limit < 1:
         raise ValueError(f"--limit: expected at least 1, got {options.limit}")
-    if not options.recordings and (options.mosaic or options.hot_pixels or options.background):
-        raise ValueError("--mosaic, --hot-pixels and --background apply to --recordings only; leave them out")
+    if not options.recordings and (listed := given(options, ["mosaic", *CLEANING])):
+        raise ValueError(f"{listed}: apply to --recordings only; leave it out")
     settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
     folder = working_folder()
-    root = own.resolve() if own else None
-    name = root.name if root else "event_budget"
-    out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
-    weights = options.weights.resolve() if options.weights else None
-    cleaning = cleaning_of(options)
+    name = own.resolve().name if own else "event_budget"
+    options.out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
+    options.weights = options.weights and options.weights.resolve()
+    root, cleaning = own and own.resolve(), cleaning_of(options)
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
         # all cores, and small parts, which share few scenes evenly among them; an override replaces both
@@ -100,38 +70,93 @@ def _benchmark(options: argparse.Namespace) -> int:
         config = load(settings, [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         if root is None:
-            return _study(options, config, out, weights)
-        return _own_folder(options, config, root, cleaning, out, weights)
+            _study(options, config)
+            return
+        notes = _score_folder(options, config, root, cleaning)
+    print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
+    print(f"page: {options.out / 'index.html'}")
 
 
-def _own_folder(
-    options: argparse.Namespace, config: "Config", root: Path, cleaning: "Cleaning", out: Path, weights: Path | None
-) -> int:
-    from polarnet.cli.own_scenes import Request, benchmark_folder, benchmark_recordings
-    from polarnet.reports.artefacts import read_results, results_table
-    from polarnet.reports.tables import as_plain
-    from polarnet.stokes import parse_mosaic
-
-    source = "--scenes" if options.scenes else "--recordings"
-    command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
-    with run_folder(out, f"benchmark {source}") as folder:
-        request = Request(root, folder, out / WORK, weights, command)
-        if options.scenes:
-            notes = benchmark_folder(config, request, options.kind, options.limit)
-        else:
-            notes = benchmark_recordings(config, request, parse_mosaic(options.mosaic or PDAVIS), cleaning)
-    print(as_plain(results_table(read_results(out))))
-    for note in notes:
-        print(note)
-    print(f"page: {out / 'index.html'}")
-    return 0
-
-
-def _study(options: argparse.Namespace, config: "Config", out: Path, weights: Path | None) -> int:
-    from polarnet.cli.studies import STUDIED, run_event_budget
-
+def _study(options: argparse.Namespace, config: Config) -> None:
     methods = options.methods.split(",") if options.methods else STUDIED
-    with run_folder(out, "benchmark --event-budget") as folder:
-        run_event_budget(config, folder, methods, options.limit, weights)
-    print(f"wrote to {out}: {', '.join(sorted(path.name for path in out.iterdir() if path.name != MARKER))}")
-    return 0
+    with run_folder(options.out, "benchmark --event-budget") as folder:
+        run_event_budget(config, folder, methods, options.limit, options.weights)
+    files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
+    print(f"wrote to {options.out}: {', '.join(files)}")
+
+
+def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
+    """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out.
+
+    Size, duration and sensor of simulated scenes are printed first, with a warning if a network was trained with
+    others. ValueError if the folder has no usable file, or if the weights of a network or of LPIPS are missing.
+    """
+    if options.weights is not None and not options.weights.is_file():
+        raise ValueError(
+            f"--weights {options.weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
+        )
+    source = "--scenes" if options.scenes else "--recordings"
+    weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
+    lpips = None if weights is None else Lpips.of(weights.backbone, weights.tensors)
+    wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
+    context = context_of(config, wanted, _train_mean(config), options.weights or shipped_weights())
+    methods, left_out = available(wanted, context)
+    if options.recordings:
+        left_out |= {row: NOT_ROTATING for row in methods if is_rotating(row)}
+        methods = [row for row in methods if row not in left_out]
+    settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK
+    with run_folder(options.out, f"benchmark {source}") as folder:
+        if options.scenes:
+            used = configured(config.synthesize, config.emulate)
+            conditions = announced(used, metadata_used(methods, context), SET_THEM)
+            notes = _make_scenes(options, config, root, work)
+        else:
+            conditions = {"sentence": RECORDED_SENTENCE, "recorded": True, "warnings": []}
+            notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
+        notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
+        rotating = _rotating_events(config, work) if any(map(is_rotating, methods)) else None
+        test_set = made_set(root.name, work, rotating)
+        mapper = config.mapper("benchmark")
+
+        def mapped(task: Callable[[str], Any], names: Sequence[str]) -> list[Any]:
+            return mapper(functools.partial(on_one_thread, task), names)
+
+        benchmark = run_benchmark(test_set, context, settings, lpips, mapped)
+        details = {
+            "set": test_set.name,
+            "lpips": NO_RECORD if weights is None else weights.record,
+            "train_mean": context.train_mean,
+            "weights": weights_used(methods, context),
+            "conditions": conditions,
+            "left_out": notes,
+        }
+        write_benchmark(folder, benchmark, settings, config.seed, details)
+        command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
+        write_set_page(folder, test_set.name, command, [*conditions["warnings"], *notes])
+    return notes
+
+
+def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:
+    """Simulate the pictures of a folder; returns a line for each file that was skipped."""
+    try:
+        make_folder_set(root, options.kind, work, config.recipe, config.mapper, options.limit)
+    except ValueError as error:
+        raise ValueError(f"--scenes {root}: no scene to score. {error}") from error
+    manifest = read_manifest(work / "images")
+    simulated = set(SceneStore.open(work / "scenes.zarr").scene_of.values())
+    unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in simulated))
+    _, small = motions_of(unused, config.synthesize, config.seed)
+    return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
+
+
+def _rotating_events(config: Config, work: Path) -> Path:
+    """Emulate the scenes behind a rotating polarizer; returns the path of the events."""
+    events, mapper = work / "rotating.zarr", config.mapper("emulate_rotating")
+    emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
+    return events
+
+
+def _train_mean(config: Config) -> float | None:
+    """Mean DoLP of the pipeline's training split; None if the pipeline has not made the split."""
+    frames = Path(config.paths.frames)
+    return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None

@@ -1,101 +1,68 @@
-"""Report on this machine: versions, device and resources that matter to polarnet."""
+"""`polarnet doctor`: versions, device and resources of this machine that matter to polarnet."""
 
-import importlib.metadata
+import argparse
+import functools
 import platform
 import shutil
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import psutil
 import torch
 
-from polarnet.cli.project import settings_root
-from polarnet.config.pipeline import setup_of
-from polarnet.config.tree import load
-from polarnet.methods import METHODS
 from polarnet.metrics.lpips import BACKBONES, local_source
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import bf16_units, usable_cores
-from polarnet.terminal.installation import EXTRAS, installation, missing, requirements
+from polarnet.terminal.installation import EXTRAS, installation, missing, requirements, version_of
 
-PACKAGES = ("torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless", "scikit-image",
-            "dvc", "hydra-core")  # fmt: skip
+PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless",
+            "scikit-image", "dvc", "hydra-core")  # fmt: skip
 
 
-def findings() -> Iterator[str]:
-    """Readable lines on versions, device, bf16 and AMX, weights, extras, memory and free disk space."""
-    yield f"polarnet   {_version('polarnet')}"
-    yield f"system     Python {platform.python_version()}, {platform.platform()}"
-    yield "packages   " + ", ".join(f"{name} {_version(name)}" for name in PACKAGES)
-    yield f"device     {_device()}"
-    yield f"threads    {usable_cores()} cores, torch uses {torch.get_num_threads()}"
-    yield f"bf16       {_bf16()}"
-    for backbone in BACKBONES:
-        yield f"LPIPS      {_lpips(backbone)}"
-    yield f"weights    {_shipped()}"
-    for extra, task in EXTRAS.items():
-        yield f"extra      {_extra(extra, task)}"
+def doctor(options: argparse.Namespace) -> None:
+    """Print a line on each finding."""
+    for subject, finding in _findings():
+        print(f"{subject:10} {finding}")
+
+
+def _findings() -> Iterator[tuple[str, str]]:
+    cuda = torch.cuda.is_available()
+    gpus = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())) if cuda else ""
+    units = ", ".join(bf16_units(torch.device("cuda" if cuda else "cpu")))
     memory = psutil.virtual_memory()
-    yield f"memory     {memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
-    yield f"disk       {shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
+    yield "system", f"Python {platform.python_version()}, {platform.platform()}"
+    yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in PACKAGES)
+    yield "device", gpus or f"CPU ({platform.processor() or platform.machine()}); no GPU that torch can use"
+    yield "threads", f"{usable_cores()} cores, torch uses {torch.get_num_threads()}"
+    yield "bf16", units or "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
+    for backbone in BACKBONES:
+        yield "LPIPS", _or_error(functools.partial(_lpips, backbone))
+    yield "weights", _or_error(_shipped)
+    for extra, task in EXTRAS.items():
+        yield "extra", f"{extra} ({task}): {_extra(extra)}"
+    yield "memory", f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
+    yield "disk", f"{shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
 
 
-def rows_for(file: Path) -> Iterator[str]:
-    """Rows that can use a file of weights, with the parameters of its network; ValueError if there are none."""
-    config, reasons, matches = load(settings_root()), {}, 0
-    for method in METHODS.values():
-        if method.weights is None or method.wraps is not None:
-            continue
-        try:
-            recoverer = method.open(setup_of(config, method, file))
-        except (ValueError, FileNotFoundError, KeyError) as error:
-            reasons[method.name] = str(error).partition("\n")[0][:160]
-            continue
-        matches += 1
-        count = sum(one.numel() for one in recoverer.network.parameters()) if recoverer.network else 0
-        yield f"{file.name}: row {method.name} ({method.label}), {count:,} parameters"
-    if not matches:
-        raise ValueError(f"{file}: no method can use it; " + "; ".join(f"{n}: {text}" for n, text in reasons.items()))
+def _or_error(finding: Callable[[], str]) -> str:
+    try:
+        return finding()
+    except (ValueError, FileNotFoundError) as error:
+        return str(error)
 
 
 def _lpips(backbone: str) -> str:
-    try:
-        return f"{backbone}: {local_source(backbone, None)}"
-    except ValueError as error:
-        return str(error)
+    return f"{backbone}: {local_source(backbone, None)}"
 
 
 def _shipped() -> str:
-    """The checkpoint that comes with the package, and its network."""
-    try:
-        file = shipped_weights()
-    except FileNotFoundError as error:
-        return str(error)
+    file = shipped_weights()
     return f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {sha256(file)[:12]})"
 
 
-def _extra(extra: str, task: str) -> str:
+def _extra(extra: str) -> str:
     if not requirements(extra):
-        return f"{extra} ({task}): not known to this installation; {installation(extra)}"
+        return f"not known to this installation; {installation(extra)}"
     absent = missing(extra)
-    return f"{extra} ({task}): " + (f"{', '.join(absent)} missing; {installation(extra)}" if absent else "installed")
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "missing"
-
-
-def _device() -> str:
-    if torch.cuda.is_available():
-        return ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
-    return f"CPU ({platform.processor() or platform.machine()}); no GPU that torch can use"
-
-
-def _bf16() -> str:
-    units = bf16_units(torch.device("cuda" if torch.cuda.is_available() else "cpu"))
-    return ", ".join(units) if units else "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
+    return f"{', '.join(absent)} missing; {installation(extra)}" if absent else "installed"

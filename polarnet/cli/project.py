@@ -1,31 +1,35 @@
-"""Commands for a project of polarnet: its settings, and what is installed."""
+"""The project around the current folder, and the commands that write one or its settings: new, preset."""
 
 import argparse
+import shutil
 from pathlib import Path
 
-from polarnet.cli.parsers import Commands
+from ruamel.yaml import YAML
+
+from polarnet import __version__
+from polarnet.config.experiments import group_of, write_preset
 from polarnet.terminal.installation import shipped_settings
 
+COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
+CODE = "polarnet/"
+"""Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `REQUIREMENTS`."""
+REQUIREMENTS = "requirements.txt"
+IGNORED = """/data/*
+!/data/*/
+/data/*/*
+!/data/external/*/
+/data/external/*/*
+!/data/**/README.md
+/outputs/
+__pycache__/
+"""
+DVC = "[core]\n    analytics = false\n    no_scm = true\n"  # `dvc init --force` in a Git repository replaces it
 
-def add_to(commands: Commands) -> None:
-    """Add the commands doctor and preset."""
-    doctor = commands.add_parser(
-        "doctor",
-        help="report versions, device, weights, extras, memory and disk",
-        epilog="example: polarnet doctor --weights best.safetensors",
-    )
-    doctor.add_argument(
-        "--weights", type=Path, metavar="FILE", help="check a file of weights, and name the rows that can use it"
-    )
-    doctor.set_defaults(run=_doctor)
 
-    preset = commands.add_parser(
-        "preset",
-        help="write a named experiment or sensor into params.yaml, keeping comments",
-        epilog="example: polarnet preset smoke",
-    )
-    preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
-    preset.set_defaults(run=_preset)
+def _clone() -> Path | None:
+    here = Path.cwd().resolve()
+    files = ("params.yaml", "dvc.yaml")
+    return next((path for path in (here, *here.parents) if all((path / file).exists() for file in files)), None)
 
 
 def project_root() -> Path:
@@ -38,12 +42,6 @@ def project_root() -> Path:
     )
 
 
-def _clone() -> Path | None:
-    here = Path.cwd().resolve()
-    files = ("params.yaml", "dvc.yaml")
-    return next((path for path in (here, *here.parents) if all((path / file).exists() for file in files)), None)
-
-
 def settings_root() -> Path:
     """Folder of params.yaml and conf/: the clone at or above the current folder, else those beside the code."""
     return _clone() or shipped_settings()
@@ -54,22 +52,39 @@ def working_folder() -> Path:
     return _clone() or Path.cwd()
 
 
-def _doctor(options: argparse.Namespace) -> int:
-    from polarnet.cli.doctor import findings, rows_for
-
-    if options.weights is not None and not options.weights.is_file():
-        raise FileNotFoundError(f"--weights {options.weights}: there is no such file")
-    for finding in rows_for(options.weights) if options.weights else findings():
-        print(finding)
-    return 0
-
-
-def _preset(options: argparse.Namespace) -> int:
-    from polarnet.config.experiments import group_of, write_preset
-
+def preset(options: argparse.Namespace) -> None:
+    """Write a preset into params.yaml."""
     root = project_root()
     changed = write_preset(root, options.name)
     print(f"params.yaml now holds {group_of(root, options.name)} {options.name}: {len(changed)} values changed")
     for line in changed:
         print(f"  {line}")
-    return 0
+
+
+def new(options: argparse.Namespace) -> None:
+    """Write a project into a new or empty folder; ValueError for another one."""
+    folder: Path = options.folder
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder}: expected a new or an empty folder, got one with files; name another")
+    source = shipped_settings()
+    for path in (path for pattern in COPIED for path in sorted(source.glob(pattern))):
+        target = folder / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+    _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
+    (folder / ".dvc").mkdir()
+    for name, text in ((REQUIREMENTS, f"polarnet=={__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):
+        (folder / name).write_text(text, encoding="utf-8")
+    print(f"{folder}: run the pipeline with `cd {folder} && dvc repro`; values are in params.yaml")
+
+
+def _write_pipeline(source: Path, target: Path) -> None:
+    """Copy dvc.yaml with dependencies on polarnet's version in place of its files."""
+    yaml = YAML()
+    yaml.width = 120
+    pipeline = yaml.load(source)
+    del pipeline["artifacts"]
+    for stage in pipeline["stages"].values():
+        content = stage.get("do", stage)
+        content["deps"] = [REQUIREMENTS, *(one for one in content["deps"] if not one.startswith(CODE))]
+    yaml.dump(pipeline, target)

@@ -1,17 +1,16 @@
 """Files of `polarnet simulate`: events in several formats, true frames, and a preview, from a simulation in pieces."""
 
 import shutil
-import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float32
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.cli.spool import EventSpool
 from polarnet.clips.video import Piece
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
@@ -29,85 +28,91 @@ from polarnet.terminal.progress import ProgressBar
 STORE = "store"
 FORMATS = (STORE, *FORMS)
 EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", APPENDED, "preview.mp4", "preview.png", "spool"
-TRUTH_CONVENTIONS = {
-    "t_us": CONVENTIONS["t_us"],
-    "s0": "S0 = I0 + I90: value / 65535",
-    "dolp": CONVENTIONS["dolp"],
-    "aolp": CONVENTIONS["aolp"],
-}
+TRUTH_CONVENTIONS = {**CONVENTIONS, "s0": "S0 = I0 + I90: value / 65535"}
+COLUMNS: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
 
 
-class Outputs(NamedTuple):
-    """Files to write."""
+class Output(NamedTuple):
+    """What to write."""
 
-    formats: Sequence[str]
-    """Some of `FORMATS`."""
-    video_rate_hz: float | None
-    """Pictures a second of the preview; None: no preview."""
-    gamma: float
-    """Gamma of S0 in the preview."""
+    folder: Path
+    name: str  # of the sequence
+    formats: Sequence[str]  # some of FORMATS
+    gamma: float | None  # of S0 in the preview; None: no preview
+    attributes: dict[str, Any]  # of the event store
 
 
-class Written(NamedTuple):
-    """Result of a simulation."""
+class EventSpool:
+    """Events of a sequence on disk while its pieces arrive: a file for each column of each channel."""
 
-    duration_us: int
-    frames: int
-    """Number of true frames."""
-    height: int
-    """Rows of a channel."""
-    width: int
-    events: tuple[int, ...]
-    """Number in each channel."""
-    polarized: bool
-    """Whether any true frame has DoLP above 0."""
-    run_s: float
-    """Seconds of the simulation, without writing the files."""
-    files: list[str]
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self._sizes: list[tuple[int, int]] = []
+        folder.mkdir(parents=True)
+
+    def append(self, channels: Sequence[Events]) -> None:
+        """Add a piece of every channel."""
+        self._sizes = [(events.height, events.width) for events in channels]
+        for k, events in enumerate(channels):
+            for name in COLUMNS:
+                with (self.folder / f"{k}.{name}").open("ab") as file:
+                    file.write(getattr(events, name).numpy().tobytes())
+
+    def channels(self) -> list[Events]:
+        """All events so far; their columns stay on disk until they are used."""
+        columns = [{name: self._column(k, name) for name in COLUMNS} for k in range(len(self._sizes))]
+        return [Events(**one, height=h, width=w) for one, (h, w) in zip(columns, self._sizes, strict=True)]
+
+    def _column(self, channel: int, name: str) -> Tensor:
+        file, dtype = self.folder / f"{channel}.{name}", COLUMNS[name]
+        values = np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype)  # no map is empty
+        return torch.from_numpy(values)
 
 
 def write_simulation(
-    pieces: Iterable[Piece],
-    camera: Camera,
-    name: str,
-    folder: Path,
-    outputs: Outputs,
-    attributes: dict[str, Any],
-    total: int | None,
-) -> Written:
-    """Run a simulation and write its files into `folder`, in constant memory except for the store's columns.
+    pieces: Iterable[Piece], camera: Camera, total: int | None, output: Output
+) -> tuple[dict[str, str], list[str]]:
+    """Run a simulation and write its files, in constant memory except for the store's columns; returns facts and notes.
 
-    Events wait in a folder `spool` on disk until the simulation ends. A readout other than the perfect one also needs
-    all events of a sensor in memory. `total` is the number of true frames, for the progress bar. ValueError for a
-    simulation of more than 71 minutes or without duration.
+    Events wait on disk until the simulation ends. A readout other than the perfect one also needs all events of a
+    sensor in memory. `total` is the expected number of true frames; None: unknown. ValueError for a simulation of more
+    than 71 minutes or without duration.
     """
-    started = time.perf_counter()
-    truth = GrowingColumns(folder / TRUTH, FRAMES_PER_CHUNK, False, TRUTH_CONVENTIONS)
+    spool = EventSpool(output.folder / SPOOL)
+    truth = GrowingColumns(output.folder / TRUTH, FRAMES_PER_CHUNK, False, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
-    with EventSpool(folder / SPOOL) as spool:
-        with ProgressBar(total=total, desc="simulate", unit="frame") as bar:
-            for piece in pieces:
-                duration_us = piece.stop_us
-                if duration_us > MAX_DURATION_US:
-                    raise ValueError(f"expected at most {MAX_DURATION_US / 6e7:.0f} minutes, got more; cut the clip")
-                spool.append(piece.events)
-                for t_us, frame in zip(piece.t_us.tolist(), piece.stokes, strict=True):
-                    values = _true_frame(t_us, frame)
-                    polarized |= bool(values["dolp"].any())
-                    truth.add(values)
-                frames += len(piece.t_us)
-                bar.update(len(piece.t_us))
-        truth.flush()
-        if duration_us == 0:
-            raise ValueError("expected at least two frames, got one: nothing changes, so no pixel fires")
-        channels = leave_sensors(spool.channels(), camera, duration_us)
-        run_s = time.perf_counter() - started
-        files = _write_events(folder, name, channels, camera, duration_us, outputs, attributes)
-        if outputs.video_rate_hz is not None:
-            files += _write_preview(folder, channels, outputs.video_rate_hz, outputs.gamma)
-        size, counts = (channels[0].height, channels[0].width), tuple(map(len, channels))
-    shutil.rmtree(folder / SPOOL)
-    return Written(duration_us, frames, *size, counts, polarized, run_s, [*files, TRUTH])
+    with ProgressBar(total=total, desc="simulate", unit="frame") as bar:
+        for piece in pieces:
+            duration_us = piece.stop_us
+            if duration_us > MAX_DURATION_US:
+                raise ValueError(f"expected at most {MAX_DURATION_US / 6e7:.0f} minutes, got more; cut the clip")
+            spool.append(piece.events)
+            for t_us, frame in zip(piece.t_us.tolist(), piece.stokes, strict=True):
+                values = _true_frame(t_us, frame)
+                polarized |= bool(values["dolp"].any())
+                truth.add(values)
+            frames += len(piece.t_us)
+            bar.update(len(piece.t_us))
+    truth.flush()
+    if duration_us == 0:
+        raise ValueError("expected at least two frames, got one: nothing changes, so no pixel fires")
+    channels = leave_sensors(spool.channels(), camera, duration_us)
+    files = [*_write_events(channels, camera, duration_us, output), *_write_preview(channels, output), TRUTH]
+    shutil.rmtree(spool.folder)
+    counts = dict(zip(stokes.POLARIZER_ANGLES_DEG, map(len, channels), strict=True))
+    events, seconds = sum(counts.values()), duration_us * 1e-6
+    facts = {
+        "channels": f"4 of {channels[0].height} x {channels[0].width} px, {camera.polarizers.layout}",
+        "duration": f"{seconds:.3f} s, {frames:,} true frames",
+        "events": f"{events:,} ({events / seconds:,.0f}/s): "
+        + ", ".join(f"{count:,} at {angle}" for angle, count in counts.items())
+        + " degrees",
+        "files": ", ".join(files),
+    }
+    notes = [] if polarized else ["the frames are grey, so DoLP is 0 everywhere"]
+    if total is not None and frames < total:
+        notes.append(f"the file states {total:,} frames, {frames:,} could be read")
+    return facts, notes
 
 
 def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndarray]:
@@ -119,45 +124,34 @@ def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndar
     }
 
 
-def _write_events(
-    folder: Path,
-    name: str,
-    channels: Sequence[Events],
-    camera: Camera,
-    duration_us: int,
-    outputs: Outputs,
-    attributes: dict[str, Any],
-) -> list[str]:
+def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, output: Output) -> list[str]:
     """Files of the events: one for each sensor of the camera in formats of cameras, and all channels in the store."""
-    polarizers = camera.polarizers
-    others = [form for form in FORMS if form in outputs.formats]
-    files = []
-    with ProgressBar(total=len(outputs.formats), desc="write", unit="format") as bar:
-        if STORE in outputs.formats:
+    files, polarizers = [], camera.polarizers
+    sensors = {f"polarizer_{a:03d}": one for a, one in zip(stokes.POLARIZER_ANGLES_DEG, channels, strict=True)}
+    if polarizers.layout == "dofp" and set(output.formats) - {STORE}:
+        sensors = {"sensor": join_mosaic(channels, stokes.parse_mosaic(polarizers.mosaic))}
+    for form in ProgressBar([form for form in FORMATS if form in output.formats], "write", unit="format"):
+        if form == STORE:
             size = channels[0].height, channels[0].width
-            store = EventStore.create(folder / EVENTS, [name], *size, attributes)
-            store.write(name, channels, duration_us)
+            store = EventStore.create(output.folder / EVENTS, [output.name], *size, output.attributes)
+            store.write(output.name, channels, duration_us)
             store.finish()
             files.append(EVENTS)
-            bar.update()
-        if polarizers.layout == "dofp" and others:
-            sensors = {"sensor": join_mosaic(channels, stokes.parse_mosaic(polarizers.mosaic))}
-        else:
-            angles = stokes.POLARIZER_ANGLES_DEG
-            sensors = {f"polarizer_{a:03d}": events for a, events in zip(angles, channels, strict=True)}
-        for form in others:
-            suffix, write = FORMS[form]
-            for sensor, events in sensors.items():
-                write(folder / f"{sensor}{suffix}", events, duration_us)
-                files.append(f"{sensor}{suffix}")
-            bar.update()
+            continue
+        suffix, write = FORMS[form]
+        for sensor, events in sensors.items():
+            write(output.folder / f"{sensor}{suffix}", events, duration_us)
+            files.append(f"{sensor}{suffix}")
     return files
 
 
-def _write_preview(folder: Path, channels: Sequence[Events], rate_hz: float, gamma: float) -> list[str]:
+def _write_preview(channels: Sequence[Events], output: Output) -> list[str]:
     """Write a video with one picture for the events between two true frames, and its busiest picture."""
-    busiest = write_true_video(folder / VIDEO, channels, open_truth(folder / TRUTH, ""), rate_hz, gamma)
+    if output.gamma is None:
+        return []
+    truth = open_truth(output.folder / TRUTH, "")
+    busiest = write_true_video(output.folder / VIDEO, channels, truth, gamma=output.gamma)
     if busiest is None:
         return []
-    (folder / PICTURE).write_bytes(encode_png(busiest))
+    (output.folder / PICTURE).write_bytes(encode_png(busiest))
     return [VIDEO, PICTURE]

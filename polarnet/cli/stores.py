@@ -1,105 +1,66 @@
-"""Commands for stores: view, verify, video, replay."""
+"""Commands that look at stores and recordings: inspect, view, video, replay, verify."""
 
 import argparse
+import functools
+import os
 import sys
+import webbrowser
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.cli.parsers import Commands, add_reading, add_stored_sequence, reading_of
+from polarnet.cli.options import HOT_FACTOR, reading_of
+from polarnet.networks.base.checkpoint import load_checkpoint
+from polarnet.recordings.inspection import findings, inspect_recording
+from polarnet.recordings.live import replay as replay_events
+from polarnet.recordings.recording import open_recording, read_recording
+from polarnet.reports.player import write_player
+from polarnet.reports.preview import write_true_video
+from polarnet.reports.recordings import draw_hot_pixels, recording_picture
+from polarnet.reports.viewing import films_of
+from polarnet.runtime.files import SUMS, changed_files
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore, SplitStore
+from polarnet.storage.groups import open_group
+from polarnet.storage.parts import Store, unknown_sequence
+from polarnet.storage.scenes import SceneStore
+from polarnet.storage.true_frames import open_truth, truth_beside
+from polarnet.training.engine.recorder import read_running
+
+STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
+FILES: dict[str, Callable[[Path], object]] = {".safetensors": load_checkpoint, ".pt": read_running}
+UNFINISHED = (".tmp", ".partial", ".old")
 
 
-def add_to(commands: Commands) -> None:
-    """Add the commands view, verify, video and replay."""
-    for add in (_add_view, _add_verify, _add_video, _add_replay):
-        add(commands)
+def inspect(options: argparse.Namespace) -> None:
+    """Print a summary of a camera's file and draw it, or list the sequences of a store."""
+    if options.part is None and is_store(options.file):
+        print(*_listing(options.file), sep="\n")
+        return
+    file = Path(options.file)
+    inspection = inspect_recording(open_recording(file, part=options.part, **reading_of(options)), HOT_FACTOR)
+    print(*findings(inspection), sep="\n")
+    folder = options.out or Path("outputs", "inspect")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{file.name}.png").write_bytes(recording_picture(inspection))
+    print(f"picture     {folder / file.name}.png")
+    if inspection.hot.any():
+        draw_hot_pixels(inspection.counts, inspection.hot, folder / f"{file.name}.hot.png")
+        print(f"hot pixels  {folder / file.name}.hot.png")
 
 
-def _add_view(commands: Commands) -> None:
-    view = commands.add_parser(
-        "view",
-        help="look at a store, a recording or a recovery in a page that plays it",
-        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
-        epilog="example: polarnet view data/frames.zarr --sequence lake-00",
-    )
-    view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
-    view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
-    view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
-    view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
-    add_reading(view)
-    view.set_defaults(run=_view)
-
-
-def _add_verify(commands: Commands) -> None:
-    verify = commands.add_parser(
-        "verify",
-        help="check every byte of a store, a checkpoint or a data folder",
-        epilog="example: polarnet verify data/events.zarr",
-    )
-    verify.add_argument(
-        "store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or data folder"
-    )
-    verify.set_defaults(run=_verify)
-
-
-def _add_video(commands: Commands) -> None:
-    video = commands.add_parser(
-        "video",
-        help="draw a stored sequence and its truth as a video that browsers play",
-        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
-        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` "
-        "draws predictions.",
-        epilog="examples:\n  polarnet video outputs/simulate/lake/events.zarr\n"
-        "  polarnet video data/events.zarr lake-0 --out lake.mp4",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    video.add_argument("store", help="event store: folder or fsspec URL")
-    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
-    video.add_argument(
-        "--truth", metavar="FRAMES", help="frames.zarr or truth.zarr with its true frames (default: beside the store)"
-    )
-    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
-    video.add_argument(
-        "--video-rate", type=float, default=30.0, metavar="HZ", help="pictures a second of the video (default: 30)"
-    )
-    video.set_defaults(run=_video)
-
-
-def _add_replay(commands: Commands) -> None:
-    replay = commands.add_parser(
-        "replay",
-        help="print a stored sequence as lines `t x y p angle`, at its own pace",
-        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into "
-        "`polarnet recover - --live` to try live recovery without a camera.",
-        epilog="example: polarnet replay data/events.zarr lake-0 --speed 0.5",
-    )
-    add_stored_sequence(replay)
-    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
-    replay.set_defaults(run=_replay)
-
-
-def _view(options: argparse.Namespace) -> int:
-    import functools
-    import webbrowser
-
-    from polarnet.recordings.recording import read_recording
-    from polarnet.reports.player import write_player
-    from polarnet.reports.viewing import films_of
-
+def view(options: argparse.Namespace) -> None:
+    """Write a page that plays a store, a recording or a recovery, and open it."""
     films = films_of(options.path, options.sequence, functools.partial(read_recording, **reading_of(options)))
-    path = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_player(path, f"{options.path}", films, {"command": f"polarnet view {options.path}"})
-    print(f"page {path}")
+    page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
+    page.parent.mkdir(parents=True, exist_ok=True)
+    write_player(page, f"{options.path}", films, {"command": f"polarnet view {options.path}"})
+    print(f"page {page}")
     if not options.no_browser:
-        webbrowser.open(path.resolve().as_uri())
-    return 0
+        webbrowser.open(page.resolve().as_uri())
 
 
-def _video(options: argparse.Namespace) -> int:
-    from polarnet.reports.preview import write_true_video
-    from polarnet.storage.events import EventStore
-    from polarnet.storage.parts import unknown_sequence
-    from polarnet.storage.true_frames import open_truth, truth_beside
-
+def video(options: argparse.Namespace) -> None:
+    """Draw a stored sequence and its truth."""
     store = EventStore.open(options.store)
     name = store.sequences[0] if options.sequence is None and len(store.sequences) == 1 else options.sequence
     if name not in store.sequences:
@@ -110,37 +71,92 @@ def _video(options: argparse.Namespace) -> int:
             f"{options.store}: expected frames.zarr or truth.zarr beside it, there is none; name the true frames with "
             f"--truth, or draw predictions with `polarnet recover {options.store}`"
         )
-    out = options.out or Path("outputs") / "video" / f"{name}.mp4"
+    out = options.out or Path("outputs", "video", f"{name}.mp4")
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_true_video(out, store.read(name), open_truth(truth, name), options.video_rate)
+    write_true_video(out, store.read(name), open_truth(truth, name))
     print(f"video {out}")
-    return 0
 
 
-def _verify(options: argparse.Namespace) -> int:
-    from polarnet.cli.verification import verified
-
-    results = list(verified(options.store))
-    if not results:
-        raise ValueError(f"{options.store}: expected a store, a checkpoint or a folder that holds some, found none")
-    problems = [problem for _, found in results for problem in found]
-    for problem in problems:
-        print(problem)
-    for name, found in results:
-        if not found:
-            print(f"{name}: intact")
-    return 1 if problems else 0
-
-    return 0
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from polarnet.recordings.live import replay
-    from polarnet.storage.events import EventStore
+def replay(options: argparse.Namespace) -> None:
+    """Print the events of a stored sequence at its pace."""
 
     def write(data: bytes) -> None:
         sys.stdout.buffer.write(data)
         sys.stdout.buffer.flush()
 
-    replay(EventStore.open(options.store).read(options.sequence), options.speed, write)
-    return 0
+    replay_events(EventStore.open(options.store).read(options.sequence), options.speed, write)
+
+
+def verify(options: argparse.Namespace) -> int:
+    """Print the problems of every artefact at or below a path; returns 1 if there are any."""
+    results = list(verified(options.store))
+    if not results:
+        raise ValueError(f"{options.store}: expected a store, a checkpoint or a folder that holds some, found none")
+    problems = [problem for _, found in results for problem in found]
+    print(*problems, *(f"{name}: intact" for name, found in results if not found), sep="\n")
+    return 1 if problems else 0
+
+
+def is_store(path: str) -> bool:
+    """Whether a path, or an fsspec URL, is that of a store."""
+    return "://" in path or (Path(path) / "zarr.json").is_file()
+
+
+def verified(path: str) -> Iterator[tuple[str, list[str]]]:
+    """Each artefact at or below a path (or at an fsspec URL), and its problems.
+
+    Unfinished and temporary folders are not read. ValueError for a file of another kind.
+    """
+    if "://" in path or Path(path).suffix == ".zarr":
+        yield path, _store_problems(path)
+    elif not Path(path).is_dir():
+        yield path, _file_problems(Path(path))
+    else:
+        for place, folders, files in os.walk(path):
+            here = Path(place)
+            if SUMS in files:
+                yield place, changed_files(here)
+            for store in sorted(name for name in folders if name.endswith(".zarr")):
+                yield str(here / store), _store_problems(str(here / store))
+            folders[:] = sorted(name for name in folders if not name.endswith((".zarr", *UNFINISHED)))
+            for file in (here / name for name in sorted(files) if Path(name).suffix in FILES):
+                if file.suffix == ".pt" or file.with_suffix(".json").exists():
+                    yield str(file), _file_problems(file)
+
+
+def _store_problems(path: str) -> list[str]:
+    try:
+        kind = _kind_of(path)
+    except (FileNotFoundError, ValueError) as error:
+        return [str(error)]
+    return kind.verify(path)
+
+
+def _file_problems(file: Path) -> list[str]:
+    if file.suffix not in FILES:
+        raise ValueError(f"{file}: expected a store, a folder, a checkpoint (.safetensors) or running.pt")
+    try:
+        FILES[file.suffix](file)
+    except (FileNotFoundError, ValueError) as error:
+        return [str(error)]
+    return []
+
+
+def _kind_of(path: str) -> type[Store]:
+    form = open_group(path).attrs.get("format")
+    if form not in STORES:
+        raise ValueError(f"{path}: expected a store of format {', '.join(STORES)}, got {form!r}")
+    return STORES[form]
+
+
+def _listing(path: str) -> Iterator[str]:
+    """A line for each sequence of a store: its duration and events, or its split."""
+    store = _kind_of(path).open(path)
+    width = max(map(len, store.sequences), default=0)
+    for name in store.sequences:
+        facts = ""
+        if isinstance(store, EventStore):
+            facts = f"{store.duration_us(name) * 1e-6:8.3f} s  {sum(store.count(name)):12,d} events"
+        elif isinstance(store, SplitStore):
+            facts = store.splits[name]
+        yield f"{name:{width}s}  {facts}"

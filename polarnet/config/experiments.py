@@ -1,6 +1,10 @@
-"""Named presets in conf/: overrides that Hydra reads directly and DVC reads through params.yaml."""
+"""Presets of conf/ and overrides of a command line, checked before Hydra reads them or written into params.yaml."""
 
+import fnmatch
+import functools
+import re
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +13,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
+from polarnet.runtime.sections import unknown_key
 from polarnet.terminal.installation import shipped_settings
 
 MAPPINGS = ("randomise",)
@@ -16,6 +21,7 @@ MAPPINGS = ("randomise",)
 
 GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
+CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 
 
 class WithNulls(RoundTripRepresenter):
@@ -42,9 +48,8 @@ def preset_values(root: Path, group: str, name: str) -> dict[str, Any]:
 def group_of(root: Path, name: str) -> str:
     """Group that contains a preset of this name; a ValueError lists the existing presets."""
     names = {group: preset_names(root, group) for group in GROUPS}
-    for group, of_group in names.items():
-        if name in of_group:
-            return group
+    if groups := [group for group, of_group in names.items() if name in of_group]:
+        return groups[0]
     listed = "; ".join(f"{group}: {', '.join(of_group)}" for group, of_group in names.items())
     raise ValueError(f"no preset {name!r}; there are {listed}")
 
@@ -61,17 +66,14 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml.width = 120
     yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
-    params = yaml.load(path)
-    changed = []
+    params, base = yaml.load(path), _flat(_original(root))
     undone = GROUPS if group == "experiment" else (group,)
     others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
-    base = _original(root)
-    values = {key: _value(base, key) for other in others for key in other} | preset_values(root, group, name)
+    values = {key: base.get(key) for other in others for key in other} | preset_values(root, group, name)
+    changed = []
     for key, value in values.items():
         *sections, last = key.split(".")
-        node = params
-        for section in sections:
-            node = node[section]
+        node = functools.reduce(lambda node, section: node[section], sections, params)
         if last not in node:
             raise ValueError(f"{group} {name!r} sets {key}, which params.yaml does not have")
         if node[last] != value:
@@ -85,16 +87,8 @@ def write_preset(root: Path, name: str) -> list[str]:
 def _original(root: Path) -> Any:
     """params.yaml as last committed, or as it came with polarnet."""
     committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
-    if committed.returncode == 0:
-        return YAML(typ="safe").load(committed.stdout)
-    return YAML(typ="safe").load(shipped_settings() / "params.yaml")
-
-
-def _value(params: Any, key: str) -> Any:
-    """Value of a dotted key; None if there is none."""
-    for part in key.split("."):
-        params = params.get(part) if isinstance(params, dict) else None
-    return params
+    shipped = shipped_settings() / "params.yaml"
+    return YAML(typ="safe").load(shipped if committed.returncode else committed.stdout)
 
 
 def _in_style(value: Any) -> Any:
@@ -116,3 +110,31 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
+
+
+def check_overrides(settings: type, root: Path, overrides: list[str], presets: Path | None = None) -> None:
+    """Raise ValueError for an override of a key that `settings` lacks, or of a group that has no such choice.
+
+    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
+    lists the available keys and choices.
+    """
+    groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+~").split("@")[0]
+        if key in groups:
+            _check_choices([root, presets] if presets else [root], key, value)
+        elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(settings, key.split("."))):
+            raise ValueError(refusal)
+
+
+def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:
+    """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+
+    Other Hydra syntax, such as choice(...), is left to Hydra to check.
+    """
+    known = sorted({name for root in roots for name in preset_names(root, group)})
+    plain = CHOICES.fullmatch(value)
+    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
+        if not fnmatch.filter(["null", *known], name):
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")

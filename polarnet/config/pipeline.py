@@ -2,16 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from polarnet.benchmark.results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
-from polarnet.events.rotation import steady_rotation
+from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.references import REFERENCES
@@ -32,35 +31,28 @@ def context_of(config: Config, rows: Iterable[str], train_mean: float | None, we
 
 
 def setup_of(config: Config, method: Method, weights: Path | None = None) -> Setup:
-    """Inputs of a method, with `weights`, else those that section `rows` names."""
-    rotation = None
-    if method.rotating:
-        rotating = _rotating_of(config)
-        rotation = steady_rotation(rotating["rate_hz"], math.radians(rotating["start_angle_deg"]))
+    """Inputs of a method, with `weights`, else those that section `rows` names.
+
+    A row NAME+gain that is not listed has the weights of NAME.
+    """
+    if weights is None and method.weights is not None:
+        weights = config.weights_of(method.name) or config.weights_of(method.section)
     return Setup(
         config=getattr(config.methods, method.section, None),
-        weights=weights or _weights_of(config, method),
+        weights=weights,
         sharpening=config.methods.sharpening,
         gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation=rotation,
+        rotation=_rotation_of(config) if method.rotating else None,
     )
 
 
-def _weights_of(config: Config, method: Method) -> Path | None:
-    """File that section `rows` names for a method; a row NAME+gain that is not listed has the weights of NAME."""
-    if method.weights is None:
-        return None
-    return config.weights_of(method.name) or config.weights_of(method.section)
-
-
-def _rotating_of(config: Config) -> Mapping[str, Any]:
-    """Section `rotating` that the pipeline's events behind a rotating polarizer were made with; else that of today."""
+def _rotation_of(config: Config) -> Rotation:
+    """That of the pipeline's events behind a rotating polarizer; without them, that of section `rotating`."""
     events = Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr"
-    if events.exists():
-        return EventStore.open(events).attributes["rotating"]
-    return dataclasses.asdict(config.rotating)
+    made = EventStore.open(events).attributes["rotating"] if events.exists() else dataclasses.asdict(config.rotating)
+    return steady_rotation(made["rate_hz"], math.radians(made["start_angle_deg"]))
 
 
 def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> BenchmarkSet:
@@ -69,15 +61,18 @@ def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> Benchma
         return made_set(RECORDINGS, Path(config.paths.calibrated))
     rotating = Path(config.paths.rotating) / f"{name}.zarr" if any(map(is_rotating, rows)) else None
     if name == "simulated":
-        events, frames = EventStore.open(config.paths.events), FrameStore.open(config.paths.frames)
-        return BenchmarkSet(name, events, frames, None if rotating is None else EventStore.open(rotating))
+        return _set_of(name, Path(config.paths.events), Path(config.paths.frames), rotating)
     return made_set(name, Path(config.paths.sets) / name, rotating)
 
 
 def made_set(name: str, folder: Path, rotating: Path | None = None) -> BenchmarkSet:
     """Open a test set that `polarnet.simulation.sets` made in `folder`, and its events behind a rotating polarizer."""
-    events, frames = EventStore.open(folder / "events.zarr"), FrameStore.open(folder / "frames.zarr")
-    return BenchmarkSet(name, events, frames, None if rotating is None else EventStore.open(rotating))
+    return _set_of(name, folder / "events.zarr", folder / "frames.zarr", rotating)
+
+
+def _set_of(name: str, events: Path, frames: Path, rotating: Path | None) -> BenchmarkSet:
+    further = None if rotating is None else EventStore.open(rotating)
+    return BenchmarkSet(name, EventStore.open(events), FrameStore.open(frames), further)
 
 
 def rows_of_set(name: str, rows: Sequence[str]) -> list[str]:
@@ -125,10 +120,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
 
 
 def lpips_of(config: Config) -> Lpips | None:
-    """Load LPIPS for the table with the weights that stage `weights` wrote.
-
-    Returns None if the table has no LPIPS column. Raises ValueError if the weights are missing.
-    """
+    """LPIPS of the table, by the weights that stage `weights` wrote; None without LPIPS, ValueError without weights."""
     if not config.benchmark.lpips:
         return None
     return Lpips.load(config.paths.weights, "benchmark", config.benchmark.lpips_backbone)

@@ -1,8 +1,7 @@
-"""Table and plot at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
+"""Table at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
 
 import csv
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
@@ -12,7 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.config.origins import first_difference
-from polarnet.training.engine.recorder import HISTORY, best_row, read_history
+from polarnet.training.engine.history import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
@@ -20,12 +19,10 @@ FINISHED = "finished.json"
 """File in the folder of a finished job with all of its values, and hashes of its inputs."""
 SCORES = {"validation": ("mse", "psnr"), "test": ("mse", "psnr", "ssim", "lpips", "corr")}
 """Scores of a point by split; test scores rank nothing."""
-LOG_RECORD = re.compile(r"^\[[^\]]*\]\[[^\]]*\]\[(\w+)\] - ", re.MULTILINE)  # Hydra's format of job logs
-PYTHON_WARNING = re.compile(r"^\S+:\d+: (\w+: .*)$", re.MULTILINE)
 
 
 class SweepTable(Callback):
-    """Writes comparison.csv and comparison.png into the sweep's folder and prints the ranking (conf/config.yaml)."""
+    """Writes comparison.csv into the sweep's folder and prints the ranking (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Collect the trials and write their table; a sweep of another entry point has no trials and gets no table.
@@ -38,9 +35,7 @@ class SweepTable(Callback):
             return
         rows = sweep_rows(points)
         write_csv(rows, folder / "comparison.csv")
-        if axes := swept_axes(rows):
-            (folder / "comparison.png").write_bytes(_plot(*axes))
-        print(f"\n{ranking(rows)}\n{best_point(rows)}\nAll scores: {folder / 'comparison.csv'}")
+        print(f"\n{ranking(rows)}\nAll scores: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
 
@@ -59,37 +54,27 @@ def mark_finished(job: Path, record: Mapping[str, Any]) -> None:
     (job / FINISHED).write_text(json.dumps(record) + "\n")
 
 
-def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
-    """One sentence on the first of `sweep_rows`, with the 95 % interval of the mean over seeds (Student's t)."""
-    from scipy.stats import t  # slow to import
-
-    best = rows[0]
-    if not best["validation"]:
-        return "No point finished."
-    mse, count = best["validation"]["mse"], len(best["seeds"])
-    shared = shared_overrides(rows)
-    own = " ".join(one for one in best["overrides"] if one not in shared)
-    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
-    if mse["std"] is None:
-        return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
-    half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
-    return f"{words}, 95 % interval over {count} seeds {mse['mean'] - half:.4f} to {mse['mean'] + half:.4f}."
-
-
-def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Overrides that all of several `sweep_rows` have; none of a single row."""
-    first, *others = (row["overrides"] for row in rows)
-    return [one for one in first if others and all(one in overrides for overrides in others)]
-
-
 def sweep_points(folder: Path) -> list[dict[str, Any]]:
-    """Trials of a sweep in the order of the jobs: overrides, seed, loss weights, scores, notes and reason of failure.
+    """Trials of a sweep in the order of the jobs: overrides, seed, scores and the reason of a failure.
 
     `validation` holds the scores of the best epoch, and `test` holds those of `ours`; None if a trial has none.
     """
     jobs = [path.parent.parent for path in folder.glob("**/.hydra/overrides.yaml")]
     trials = [job for job in jobs if (job / "train").exists() or (job / FAILURE).exists()]
     return [_point(folder, job) for job in sorted(trials, key=lambda job: (len(job.name), job.name))]
+
+
+def _point(folder: Path, job: Path) -> dict[str, Any]:
+    training, metrics = job / "train" / "ours", _read(job / "benchmark" / "metrics.json")
+    unfinished = None if metrics else "it did not finish"
+    return {
+        "job": job.relative_to(folder).as_posix(),
+        "overrides": list(OmegaConf.load(job / ".hydra" / "overrides.yaml")),
+        "seed": OmegaConf.load(job / ".hydra" / "config.yaml").seed,
+        "validation": best_row(read_history(training))["val"] if (training / HISTORY).exists() else None,
+        "test": metrics["simulated"]["ours"] if metrics else None,
+        "failure": (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished,
+    }
 
 
 def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -104,19 +89,18 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for overrides, group in groups.items():
         finished = [point for point in group if not point["failure"]]
-        failures = [f"seed {point['seed']} failed: {point['failure']}" for point in group if point["failure"]]
         rows.append({
             "jobs": [point["job"] for point in group],
             "overrides": list(overrides),
             "seeds": [point["seed"] for point in finished],
             "failed_seeds": [point["seed"] for point in group if point["failure"]],
-            **{split: mean_scores([point[split] for point in finished], names) for split, names in SCORES.items()},
-            "notes": list(dict.fromkeys([*failures, *(note for point in group for note in point["notes"])])),
+            **{split: _mean_scores([point[split] for point in finished], names) for split, names in SCORES.items()},
+            "notes": [f"seed {point['seed']} failed: {point['failure']}" for point in group if point["failure"]],
         })  # fmt: skip
     return sorted(rows, key=lambda row: row["validation"]["mse"]["mean"] if row["validation"] else float("inf"))
 
 
-def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, Any]:
+def _mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, Any]:
     """Mean and standard deviation over trainings of the scores `names`; a score missing from a training is omitted."""
     means = {}
     for name in names:
@@ -126,100 +110,40 @@ def mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[st
     return means
 
 
-def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float]] | None:
-    """Values of the keys that differ between finished rows, and their validation MSE; None if no key differs."""
-    done = [row for row in rows if row["validation"]]
-    given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
-    keys = [
-        key for key in dict.fromkeys(key for one in given for key in one) if len({one.get(key) for one in given}) > 1
-    ]
-    if not keys:
-        return None
-    return {key: [one.get(key, "-") for one in given] for key in keys}, [
-        row["validation"]["mse"]["mean"] for row in done
-    ]
-
-
 def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
-    """`sweep_rows` as lines: validation and test MSE, seeds, the overrides that not all rows share, and notes."""
-    shared = shared_overrides(rows)
+    """`sweep_rows` as lines: validation and test MSE, seeds, the overrides that not all rows share, and failures."""
+    every = [row["overrides"] for row in rows]
+    shared = [one for one in every[0] if len(every) > 1 and all(one in overrides for overrides in every)]
     lines = [f"{'validation MSE':>19}  {'test MSE':>19}  seeds   overrides"]
     for row in rows:
         finished, failed = len(row["seeds"]), len(row["failed_seeds"])
-        scores = [_printed(row[split].get("mse")) for split in SCORES]
+        validation, test = (_printed(row[split].get("mse")) for split in SCORES)
         seeds = f"{finished} of {finished + failed}" if failed else f"{finished}"
         own = " ".join(one for one in row["overrides"] if one not in shared)
-        lines.append(f"{scores[0]:>19}  {scores[1]:>19}  {seeds:<6}  {own}".rstrip())
+        lines.append(f"{validation:>19}  {test:>19}  {seeds:<6}  {own}".rstrip())
         lines += [f"    {note}" for note in row["notes"]]
     return "\n".join([*lines, *([f"All have {' '.join(shared)}."] if shared else [])])
-
-
-def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write `sweep_rows` as one line each, with columns SPLIT_SCORE and SPLIT_SCORE_std."""
-    with path.open("w", newline="") as file:
-        names = [f"{split}_{name}{end}" for split in SCORES for name in SCORES[split] for end in ("", "_std")]
-        writer = csv.DictWriter(file, ["jobs", "overrides", "seeds", "failed_seeds", *names, "notes"])
-        writer.writeheader()
-        for row in rows:
-            line = {key: " ".join(map(str, row[key])) for key in ("jobs", "overrides", "seeds", "failed_seeds")}
-            for split in SCORES:
-                for name, score in row[split].items():
-                    line |= {f"{split}_{name}": score["mean"], f"{split}_{name}_std": score["std"]}
-            writer.writerow({**line, "notes": "; ".join(row["notes"])})
-
-
-def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes:
-    from polarnet.reports.charts import parallel_coordinates  # every stage imports this module, and only a sweep draws
-    from polarnet.reports.maps import png
-
-    return png(parallel_coordinates(values, scores, "validation MSE"))
-
-
-def _point(folder: Path, job: Path) -> dict[str, Any]:
-    config: Any = OmegaConf.load(job / ".hydra" / "config.yaml")
-    training = job / "train" / "ours"
-    history = read_history(training) if (training / HISTORY).exists() else []
-    metrics = _read(job / "benchmark" / "metrics.json")
-    unfinished = None if metrics else "it did not finish"
-    failure = (job / FAILURE).read_text().strip() if (job / FAILURE).exists() else unfinished
-    weights = OmegaConf.to_container(config.loss)
-    return {
-        "job": job.relative_to(folder).as_posix(),
-        "overrides": list(OmegaConf.load(job / ".hydra" / "overrides.yaml")),
-        "seed": config.seed,
-        "weights": weights,
-        "lpips_backbone": config.benchmark.get("lpips_backbone") or config.lpips.backbone,
-        "validation": best_row(history)["val"] if history else None,
-        "test": metrics["simulated"]["ours"] if metrics else None,
-        "notes": [*(_dropped_terms(weights, history[-1]["train"]) if history else []), *_warnings(job / "logs")],
-        "failure": failure,
-    }
-
-
-def _dropped_terms(weights: Any, terms: Mapping[str, float]) -> list[str]:
-    """Note on loss terms that have a nonzero weight but were missing from the training; 1 - SSIM is `ssim_loss`."""
-    computed = {term.removesuffix("_loss") for term in terms}
-    names = [name for name, weight in weights.items() if weight and name not in computed]
-    return [f"not in this training's loss: {', '.join(names)}"] if names else []
-
-
-def _warnings(logs: Path) -> list[str]:
-    """Warnings and errors in the logs of training and benchmark, one line each."""
-    notes = []
-    for log in sorted(logs.glob("*/*.log")):
-        _, *records = LOG_RECORD.split(log.read_text())
-        for level, text in zip(records[::2], records[1::2], strict=True):
-            if level not in ("DEBUG", "INFO"):
-                python = PYTHON_WARNING.search(text)
-                notes.append(" ".join((python[1] if python else text).split()))
-    return notes
-
-
-def _read(path: Path) -> Any:
-    return json.loads(path.read_text()) if path.exists() else None
 
 
 def _printed(score: Mapping[str, float | None] | None) -> str:
     if score is None:
         return "-"
     return f"{score['mean']:.4f}" + (f" ± {score['std']:.4f}" if score["std"] is not None else "")
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write `sweep_rows` as one line each, with columns SPLIT_SCORE and SPLIT_SCORE_std."""
+    names = [f"{split}_{name}{end}" for split in SCORES for name in SCORES[split] for end in ("", "_std")]
+    given = ("jobs", "overrides", "seeds", "failed_seeds")
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*given, *names, "notes"])
+        writer.writeheader()
+        for row in rows:
+            line = {key: " ".join(map(str, row[key])) for key in given} | {"notes": "; ".join(row["notes"])}
+            scores = {f"{split}_{name}": score for split in SCORES for name, score in row[split].items()}
+            line |= {name: score["mean"] for name, score in scores.items()}
+            writer.writerow(line | {f"{name}_std": score["std"] for name, score in scores.items()})
+
+
+def _read(path: Path) -> Any:
+    return json.loads(path.read_text()) if path.exists() else None

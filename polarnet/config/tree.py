@@ -17,9 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
-from polarnet.config.experiments import preset_values
+from polarnet.config.experiments import check_overrides, preset_values
 from polarnet.config.origins import Run
-from polarnet.config.overrides import check_overrides
 from polarnet.methods import METHODS
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import GainConfig, SharpeningConfig

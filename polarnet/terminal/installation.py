@@ -22,28 +22,20 @@ EXTRAS = {
 
 def shipped_settings() -> Path:
     """Folder of params.yaml and conf/ beside the code: the copy that setup.py puts into a wheel, or the source tree."""
-    return PACKAGE.parent if in_source_tree() else INSTALLED
-
-
-def in_source_tree() -> bool:
-    """Whether the code lies in a clone, and not in a wheel, which has a copy of the settings."""
-    return not INSTALLED.is_dir()
+    return INSTALLED if INSTALLED.is_dir() else PACKAGE.parent
 
 
 def requirements(extra: str) -> list[str]:
     """Packages of an extra with their versions; none if polarnet runs from source without being installed."""
-    try:
-        lines = importlib.metadata.requires("polarnet") or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
+    lines = (importlib.metadata.requires("polarnet") or []) if version_of("polarnet") else []
     chosen = re.compile(rf"""extra\s*==\s*['"]{extra}['"]""")
     return [line.split(";")[0].strip() for line in lines if chosen.search(line) and not line.startswith("polarnet[")]
 
 
 def missing(extra: str) -> list[str]:
     """Packages of an extra that are not installed."""
-    names = [re.split(r"[<>=!~\[ ]", one)[0] for one in requirements(extra)]
-    return [name for name in names if not _installed(name)]
+    names = (re.split(r"[<>=!~\[ ]", one)[0] for one in requirements(extra))
+    return [name for name in names if version_of(name) is None]
 
 
 def installation(extra: str) -> str:
@@ -51,14 +43,14 @@ def installation(extra: str) -> str:
 
     polarnet is on no package index, so it names the clone, or the packages where polarnet came as a wheel.
     """
-    if in_source_tree():
-        return f"run pip install -e '.[{extra}]' in the clone"
-    return f"run pip install {' '.join(map(repr, requirements(extra)))}"
+    if INSTALLED.is_dir():
+        return f"run pip install {' '.join(map(repr, requirements(extra)))}"
+    return f"run pip install -e '.[{extra}]' in the clone"
 
 
-def _installed(package: str) -> bool:
+def version_of(package: str) -> str | None:
+    """Version of an installed package; None if it is not installed."""
     try:
-        importlib.metadata.version(package)
+        return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
+        return None

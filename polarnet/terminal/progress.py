@@ -22,9 +22,8 @@ class ProgressBar(tqdm):
         """Arguments of tqdm."""
         self.disable = False
         self.terminal = sys.stderr.isatty()
-        pace = {"delay": PATIENCE_S}
-        if not self.terminal:
-            pace = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S}
+        in_log = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S}
+        pace = {"delay": PATIENCE_S} if self.terminal else in_log
         super().__init__(*arguments, **{**pace, **options})
 
     @staticmethod

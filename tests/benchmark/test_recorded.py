@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from recording_fixtures import make_events, make_random_events
+from event_fixtures import make_events, make_random_events
 
 from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from recording_fixtures import events_of, random_events
+from event_fixtures import events_of, random_events
 
 from polarnet.cli import main
 from polarnet.recordings.recording import read_recording

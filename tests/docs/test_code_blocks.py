@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 import pytest
 
-from polarnet.cli import _options, main
-from polarnet.config.overrides import check_overrides
+from polarnet.cli import main, parse
+from polarnet.config.experiments import check_overrides
 from polarnet.config.tree import Config
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,7 +77,7 @@ def test_a_command_of_the_documentation_is_accepted_by_its_parser(page, words, m
             overrides = [word for word in rest if "=" in word and not word.startswith(("ablation=", "--"))]
             check_overrides(Config, ROOT, [_first_choice(word) for word in overrides])
     elif program == "polarnet":
-        _options(arguments)
+        parse(arguments)
     elif program == "dvc":
         from dvc.cli import parse_args
 

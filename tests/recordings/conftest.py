@@ -1,5 +1,5 @@
 import pytest
-from recording_fixtures import make_events, make_random_events, same_events
+from event_fixtures import make_events, make_random_events, same_events
 
 from polarnet.recordings.recording import read_recording
 

@@ -57,8 +57,8 @@ def test_inspect_prints_the_findings_and_writes_a_picture_without_hot_pixels(
     edge = make_events([(k, k % 50, 20, 1 - 2 * (k % 2)) for k in range(100)], 800, 1280)
     hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
     write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
-    assert main(["inspect", "capture.csv", "--hot-pixels", "hot.png"]) == 0
-    assert (tmp_path / "hot.png").stat().st_size > 5000
+    assert main(["inspect", "capture.csv"]) == 0
+    assert (tmp_path / "outputs" / "inspect" / "capture.csv.hot.png").stat().st_size > 5000
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
     picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.csv.png"))
@@ -71,9 +71,9 @@ def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
     picture = np.zeros((800, 1280), np.uint16)
     picture[:, 640:] = 4095
     write_celex5_pictures(tmp_path / "p.bin", [picture, np.zeros_like(picture)], [0, 33_000])
-    assert main(["inspect", str(tmp_path / "p.bin"), "--picture", str(tmp_path / "p.png")]) == 0
+    assert main(["inspect", str(tmp_path / "p.bin"), "--out", str(tmp_path / "out")]) == 0
     assert "pictures    2" in capsys.readouterr().out
-    assert cv2.imread(str(tmp_path / "p.png"))[400, [10, 1000], 0].tolist() == [0, 255]
+    assert cv2.imread(str(tmp_path / "out" / "p.bin.png"))[400, [10, 1000], 0].tolist() == [0, 255]
 
 
 def test_empty_rows_and_the_longest_silence_are_named(tmp_path):

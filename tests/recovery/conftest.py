@@ -1,7 +1,7 @@
 """Events of four channels of 16 x 20 pixels in 0.1 s."""
 
 import pytest
-from recording_fixtures import events_of, random_events
+from event_fixtures import events_of, random_events
 
 from polarnet.events.stream import merge
 from polarnet.storage.events import EventStore

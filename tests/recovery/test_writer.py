@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import zarr
-from recording_fixtures import events_of
+from event_fixtures import events_of
 
 from polarnet.events.streaming import EventWindow
 from polarnet.recovery import writer as recovery

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from studies.docs import block_text, origin_of, read_file, read_tables, update_pages
+from studies.docs import block_text, read_file, read_tables, update_pages
 
 TABLES = """
 speed:
@@ -46,12 +46,9 @@ def test_a_table_has_a_row_for_each_entry_and_its_caption_names_machine_and_comm
     ]
 
 
-def test_rows_that_are_chosen_by_hand_look_into_the_file(project):
+def test_rows_are_chosen_by_hand_and_a_section_that_was_not_measured_says_what_measures_it(project):
     text = block_text(read_tables(project)["chosen"], read_file(project, "speed"))
     assert text == "|  | MSE |\n|---|---:|\n| the best | 0.0 |"
-
-
-def test_a_section_that_was_not_measured_says_what_measures_it(project):
     assert block_text(read_tables(project)["speed"], {}).startswith("Not measured yet")
 
 
@@ -88,9 +85,3 @@ def test_every_block_of_the_documentation_is_measured_and_shown(project_root):
         assert "Not measured" not in text, name
         assert any(digit in text for digit in "123456789"), name
         assert f"<!-- results:{name} -->" in pages
-
-
-def test_the_sentence_below_a_table_names_the_bf16_units_that_the_record_has():
-    assert origin_of({**RECORD, "bf16_units": ["AMX", "AVX512-BF16"]}).startswith(
-        "On 2 cores (Xeon with AMX and AVX512"
-    )

@@ -1,9 +1,12 @@
 """polarnet fit-sensor: table, sensor and page."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from test_simulate import SMALL
 
 from polarnet.cli import main
 from polarnet.config.tree import load
@@ -42,10 +45,6 @@ def ramps(recorded, tmp_path, monkeypatch):
     return tmp_path
 
 
-SMALL = ["synthesize.sensor_height=20", "synthesize.sensor_width=30", "synthesize.duration_s=0.1",
-         "ingest.height=60", "ingest.width=90", "synthesize.acceleration_max_px_s2=8000", "benchmark.lpips=false",
-         "train.crop=null", "baselines.e2v.crop=null", "baselines.e2p.crop=null", "loss.lpips=0",
-         "baselines.e2v.lpips=0", "baselines.e2p.lpips=0", "baselines.e2p.intensity_lpips=0"]  # fmt: skip
 FIT = ["fit-sensor", "--format", "text", "--height", str(SIDE), "--width", str(SIDE)]
 
 
@@ -62,20 +61,15 @@ def test_the_yaml_written_loads_as_a_sensor(ramps, capsys, monkeypatch):
     assert "Kolmogorov-Smirnov" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     project = ramps / "project"
-    (project / "conf").mkdir(parents=True)
-    for path in shipped_settings().glob("params.yaml"):
-        (project / path.name).write_text(path.read_text())
-    for path in (shipped_settings() / "conf").rglob("*.yaml"):
-        target = project / "conf" / path.relative_to(shipped_settings() / "conf")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(path.read_text())
+    shutil.copytree(shipped_settings() / "conf", project / "conf")
+    shutil.copy(shipped_settings() / "params.yaml", project)
     (project / "conf" / "sensor" / "mine.yaml").write_text(written)
     assert load(project, ["sensor=mine"]).emulate.contrast_threshold_on == pytest.approx(0.1733)
 
 
-def test_a_recording_without_frames_has_no_twin(ramps, capsys):
-    assert main([*FIT, "--name", "mine", "--moving", "moving.txt", "--page", "page.html"]) == 0
-    assert "Kolmogorov-Smirnov" not in (ramps / "page.html").read_text()
+def test_a_recording_without_frames_has_no_twin(ramps):
+    assert main([*FIT, "--name", "mine", "--moving", "moving.txt"]) == 0
+    assert "Kolmogorov-Smirnov" not in (ramps / "outputs" / "fit-sensor" / "mine.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -112,13 +106,9 @@ def test_outside_a_clone_the_sensor_works_in_the_folder_where_it_was_fitted(ramp
     assert "default, mine, noisy" in capsys.readouterr().err
 
 
-def test_a_sensor_of_polarnet_is_not_shadowed(ramps, capsys):
-    assert main([*FIT, "--name", "noisy", "--moving", "moving.txt"]) == 1
-    assert "choose another name" in capsys.readouterr().err
-
-
-def test_a_sensor_that_fit_sensor_did_not_write_is_not_replaced(ramps, capsys):
+def test_a_sensor_of_polarnet_or_of_the_user_is_not_replaced(ramps, capsys):
     (ramps / "conf" / "sensor").mkdir(parents=True)
     (ramps / "conf" / "sensor" / "mine.yaml").write_text("emulate: {}\n")
-    assert main([*FIT, "--name", "mine", "--moving", "moving.txt"]) == 1
-    assert "choose another name" in capsys.readouterr().err
+    for name in ("noisy", "mine"):
+        assert main([*FIT, "--name", name, "--moving", "moving.txt"]) == 1
+        assert "choose another name" in capsys.readouterr().err

@@ -1,12 +1,14 @@
-"""The pictures of docs/physics.md, and the flow of events at constant speed that one of them shows."""
+"""The pictures of docs/simulation.md and docs/physics.md, and the events at constant speed that one of them shows."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from studies.physics_pictures import FIGURES, FLAT_WIDTH, events_per_frame, periodic_scene
-from studies.simulation_pictures import QUIET
+from polarnet.reports.maps import png
+from studies import physics_pictures, simulation_pictures
+from studies.physics_pictures import FLAT_WIDTH, events_per_frame, periodic_scene
+from studies.simulation_pictures import QUIET, few_colours, light_of_one_pixel, parameters_figure, pixel_events
 
 
 def spread_and_drift(counts: np.ndarray) -> tuple[float, float]:
@@ -47,8 +49,24 @@ def test_the_pattern_repeats_after_its_period():
     assert (s0[:, :FLAT_WIDTH] == s0[:, FLAT_WIDTH : 2 * FLAT_WIDTH]).all()
 
 
-def test_the_pictures_lie_beside_the_page(project_root):
-    pages = "".join(page.read_text() for page in (project_root / "docs").glob("*.md"))
-    for name in FIGURES:
-        assert f"pictures/{name}.png" in pages
-        assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000
+def test_the_events_of_the_pixel_add_up_to_the_change_of_its_log_light():
+    """From the first to the last value the log falls by 0.6, less than a threshold short: so do the events in sum."""
+    light = light_of_one_pixel(np.array([0.0, 500.0]))
+    assert np.isclose(np.log(light[1] / light[0]), -0.6)
+    total = int(pixel_events(QUIET).p.sum()) * QUIET.contrast_threshold_on
+    assert -0.6 - 1e-6 <= total <= -0.6 + QUIET.contrast_threshold_on
+
+
+def test_half_the_threshold_gives_about_twice_the_events():
+    half = replace(QUIET, contrast_threshold_on=0.1, contrast_threshold_off=0.1)
+    assert 1.7 * len(pixel_events(QUIET)) <= len(pixel_events(half)) <= 2.5 * len(pixel_events(QUIET))
+
+
+def test_the_same_picture_is_drawn_each_time():
+    assert few_colours(png(parameters_figure())) == few_colours(png(parameters_figure()))
+
+
+@pytest.mark.parametrize("name", [*simulation_pictures.FIGURES, *physics_pictures.FIGURES])
+def test_a_picture_lies_beside_the_page_that_shows_it(project_root, name):
+    assert any(f"pictures/{name}.png" in page.read_text() for page in (project_root / "docs").glob("*.md"))
+    assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000

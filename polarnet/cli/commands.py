@@ -1,0 +1,358 @@
+"""The command line of `polarnet`: every command with its arguments. It imports no library, so help is quick."""
+
+import argparse
+import functools
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeAlias
+
+from polarnet import __version__
+
+Command: TypeAlias = argparse.ArgumentParser
+AddCommand: TypeAlias = Callable[..., Command]
+"""`_command` without its first argument."""
+
+BESIDE = ""
+"""Value of --truth without a path."""
+_wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
+
+
+def command_parser() -> argparse.ArgumentParser:
+    """Parser of all commands; `run` of its result names the module below polarnet.cli and the function of a command."""
+    parser = argparse.ArgumentParser(
+        prog="polarnet",
+        description="Degree of linear polarization (DoLP) from event cameras: simulation, training, benchmark and "
+        "recovery. `dvc repro` runs the pipeline.",
+    )
+    parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_project, _stores, _simulate, _inspect, _recover, _convert, _fit_sensor, _onnx, _benchmark):
+        add(functools.partial(_command, commands))
+    return parser
+
+
+def _command(
+    commands: "argparse._SubParsersAction[Command]",
+    name: str,
+    run: str,
+    summary: str,
+    *examples: str,
+    description: str = "",
+) -> Command:
+    command = commands.add_parser(
+        name,
+        help=summary,
+        description="\n".join(map(_wrapped, description.split("\n"))),
+        epilog="\n  ".join(["examples:", *(f"polarnet {example}" for example in examples)]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(run=run)
+    return command
+
+
+def _project(command: AddCommand) -> None:
+    demo = command(
+        "demo",
+        "simulate.demo",
+        "a first result in a minute: simulate a built-in photograph and recover its DoLP",
+        "demo sensor=noisy",
+        description="Simulates a camera with four polarizers that moves over a photograph, and recovers DoLP and AoLP "
+        "from its events with the shipped weights. `polarnet simulate` and `polarnet recover` do the halves, on your "
+        "own files.",
+    )
+    demo.add_argument("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")
+    _overrides(demo)
+    command("doctor", "doctor.doctor", "report versions, device, weights, extras, memory and disk", "doctor")
+    preset = command(
+        "preset",
+        "project.preset",
+        "write a named experiment or sensor into params.yaml",
+        "preset smoke",
+    )
+    preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
+    new = command(
+        "new",
+        "project.new",
+        "write a project with the pipeline: dvc.yaml, params.yaml, conf, stages",
+        "new lake && cd lake && polarnet preset smoke && dvc repro",
+        description="Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages "
+        "run again after a change of requirements.txt, which names polarnet's version.",
+    )
+    new.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
+
+
+def _stores(command: AddCommand) -> None:
+    view = command(
+        "view",
+        "stores.view",
+        "look at a store, a recording or a recovery in a page that plays it",
+        "view data/frames.zarr --sequence lake-00",
+        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
+    )
+    view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
+    view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
+    view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
+    view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
+    _reading(view)
+    verify = command(
+        "verify",
+        "stores.verify",
+        "check every byte of a store, a checkpoint or a data folder",
+        "verify data/events.zarr",
+    )
+    verify.add_argument("store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or folder")
+    video = command(
+        "video",
+        "stores.video",
+        "draw a stored sequence and its truth as a video that browsers play",
+        "video outputs/simulate/lake/events.zarr",
+        "video data/events.zarr lake-0 --out lake.mp4",
+        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
+        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
+        "predictions.",
+    )
+    video.add_argument("store", help="event store: folder or fsspec URL")
+    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
+    video.add_argument("--truth", metavar="FRAMES", help="frames.zarr or truth.zarr (default: beside the store)")
+    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
+    replay = command(
+        "replay",
+        "stores.replay",
+        "print a stored sequence as lines `t x y p angle`, at its own pace",
+        "replay data/events.zarr lake-0 --speed 0.5",
+        description="Prints the events of a stored sequence at the pace of the recording. Pipe them into `polarnet "
+        "recover - --live` to try live recovery without a camera.",
+    )
+    replay.add_argument("store", help="event store: folder or fsspec URL")
+    replay.add_argument("sequence", help="name of the sequence")
+    replay.add_argument("--speed", type=float, default=1.0, help="speed relative to the recording (default: 1)")
+
+
+def _simulate(command: AddCommand) -> None:
+    simulate = command(
+        "simulate",
+        "simulate.simulate",
+        "make polarization events from a photograph, a video or measured polarization",
+        "simulate lake.jpg sensor=noisy synthesize.duration_s=2",
+        "simulate walk.mp4 --size 240 320 --upsample --format store evt3",
+        "simulate frames/ --fps 100 polarizers=micropolarizers readout.max_events_per_s=5e6",
+        'simulate dofp.mp4 --mosaic "90 45 / 135 0" --out outputs/dofp',
+        description="""\
+Makes the events of a camera with four polarizers, the true DoLP and AoLP, and a preview video. INPUT is one of:
+- a photograph, or one measurement of polarization: a sensor moves over it (sections ingest and synthesize)
+- a video, or a folder of frames: hue becomes AoLP, saturation DoLP and value S0; the pixels see those of the frames
+- four videos behind polarizers, NAME_0.mp4 ... NAME_135.mp4, or a folder of frames NAME_0, NAME_45, NAME_90, NAME_135
+- with --mosaic: a video or a folder of raw frames of a polarization camera
+Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor=noisy polarizers=film seed=2.""",
+    )
+    simulate.set_defaults(overrides=[])
+    add = simulate.add_argument
+    add("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
+    add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
+    add("--format", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
+    add("--fps", type=float, metavar="HZ", help="frames a second (default: as a video states)")
+    add(
+        "--times", type=Path, metavar="FILE", help="a line with the time of each frame (default: FOLDER/timestamps.txt)"
+    )
+    add("--time-unit", choices=("us", "ms", "s"), default="us", help="unit of these times (default: us)")
+    add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="cut and reduce the frames to this size")
+    add("--upsample", action="store_true", help="interpolate frames so that nothing moves by more than 1 px a step")
+    add("--grey", action="store_true", help="take colour frames as grey, which are unpolarized")
+    add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels of raw frames: even row / odd row")
+    add("--angles", nargs=4, type=int, metavar="DEG", help="angles of four videos (default: from their names)")
+    add(
+        "--white", type=float, metavar="LEVEL", help="level of saturation (default: the most of the first frame's bits)"
+    )
+    add("--no-preview", action="store_true", help="write no preview video")
+
+
+def _inspect(command: AddCommand) -> None:
+    inspect = command(
+        "inspect",
+        "stores.inspect",
+        "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
+        "inspect recording.aedat4",
+        description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
+        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs. Of a "
+        "store it names the sequences.",
+    )
+    inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
+    _reading(inspect)
+    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
+    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
+
+
+def _recover(command: AddCommand) -> None:
+    recover = command(
+        "recover",
+        "recover.run",
+        "recover DoLP and AoLP from recordings or from a running camera",
+        'recover recording.aedat4 --mosaic "90 45 / 135 0"',
+        "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
+        "recover outputs/simulate/lake/events.zarr --truth",
+        "recover data/events.zarr --sequence lake-0 --rate 2000 --write mp4",
+        "recover camera.raw --rotating 15",
+        'recover dv://camera --live --mosaic "90 45 / 135 0"',
+        description="""\
+Writes frames, pictures, a video and a page. INPUT is one of:
+- four files, one for each polarizer, with --angles
+- one file of a camera with polarizers on its pixels, with --mosaic
+- one file of a camera behind a rotating polarizer, with --rotating or --triggers
+- an event store, or a folder that `polarnet convert` or `polarnet simulate --format hdf5` wrote
+- a folder of division-of-time captures
+- with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
+dv://HOST:PORT of a program that streams its events, or dv://camera
+With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
+    )
+    add = recover.add_argument
+    add("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
+    add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
+    add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
+    add("--rotating", type=float, metavar="HZ", help="turns per second of a polarizer before the one camera")
+    add("--triggers", type=Path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
+    add("--start-angle", type=float, metavar="DEG", help="its angle at time 0 or the first trigger (default: 0)")
+    add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
+    add(
+        "--truth", nargs="?", const=BESIDE, metavar="FRAMES",
+        help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
+    )  # fmt: skip
+    add("--live", action="store_true", help="recover while events arrive, and print the latency")
+    add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
+    add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
+    _cleaning(recover)
+    add(
+        "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"
+    )
+    add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
+    add("--rate", type=float, metavar="HZ", help="frames a second: events carry each frame on to the next window")
+    add("--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ...")
+    add("--weights", type=Path, metavar="FILE", help="checkpoint of the method's network (default: the shipped one)")
+    add(
+        "--thresholds", nargs=2, type=float, metavar=("ON", "OFF"),
+        help="contrast thresholds of the camera, natural-log intensity (default: estimated from the events)",
+    )  # fmt: skip
+    add("--binning", type=int, metavar="N", help="show the network blocks of N x N pixels (default: as in training)")
+    add("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
+    add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network (default: auto)")
+    add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
+    formats = ("zarr", "png", "mp4")
+    add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr png mp4)")
+    add("--video-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)")
+    _reading(recover)
+
+
+def _convert(command: AddCommand) -> None:
+    convert = command(
+        "convert",
+        "convert.convert",
+        "convert a recording or an event store to HDF5 (DSEC's layout), text or EVT3",
+        "convert recording.aedat4 first.h5 --start 500ms --stop 2s",
+        "convert data/events.zarr exported --to evt3 --sequence lake-0",
+        description="Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its "
+        "events, or those of a time span. Times in OUT count from the start of the span. Of an event store without "
+        "--part, writes a folder with one file for each sequence and channel.",
+    )
+    add = convert.add_argument
+    add("file", metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
+    add("out", type=Path, metavar="OUT", help="file to write; of an event store, the folder")
+    add("--to", choices=("evt3", "hdf5", "text"), help="format (default: by the suffix of OUT; of a store: hdf5)")
+    add("--start", metavar="TIME", help="start of the span after the first event: 500ms (default: 0s)")
+    add("--stop", metavar="TIME", help="end of the span after the first event, exclusive")
+    add("--part", metavar="PART", help="SEQUENCE/ANGLE of an event store, or topic of a bag")
+    add("--sequence", nargs="+", metavar="NAME", help="sequences of an event store (default: all)")
+    _reading(convert)
+
+
+def _fit_sensor(command: AddCommand) -> None:
+    fit = command(
+        "fit-sensor",
+        "fit_sensor.run",
+        "fit the simulated sensor to a camera's recordings",
+        "fit-sensor --name lab --static dark.raw --static-light 0 --moving walk.raw --frames frames/",
+        description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
+        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws a page that "
+        "compares each recording with its simulated twin. docs/fit-sensor.md says what to record.",
+    )
+    add = fit.add_argument
+    add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
+    add("--static", type=Path, metavar="FILE", help="recording under constant light")
+    add("--static-light", type=float, metavar="DN", help="its brightness, 0 (covered lens) to 255 (default: 127.5)")
+    add("--moving", type=Path, metavar="FILE", help="recording of a moving scene")
+    add(
+        "--frames", type=Path, metavar="FOLDER",
+        help="frames of the moving scene at the pixels of the sensor, and timestamps.txt: a time a frame in "
+        "microseconds of the recording's clock",
+    )  # fmt: skip
+    add("--flicker", type=Path, nargs="+", metavar="FILE", help="recordings of a lamp or display with sinusoidal light")
+    add("--contrast", type=float, metavar="C", help="contrast of the flicker, (max - min) / (max + min)")
+    add("--frequency", type=float, nargs="+", metavar="HZ", help="frequency of each flicker recording")
+    add("--flicker-light", type=float, default=127.5, metavar="DN", help="mean of the flicker (default: 127.5)")
+    add("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel, if the files are event stores")
+    _reading(fit)
+
+
+def _onnx(command: AddCommand) -> None:
+    onnx = command(
+        "onnx",
+        "convert.onnx",
+        "export a network as an ONNX file, checked with ONNX Runtime",
+        "onnx polarnet.onnx --height 260 --width 346",
+        description="The exported network takes the events of one window and a state, and returns DoLP and the new "
+        "state; the file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX "
+        "Runtime reproduces torch's outputs.",
+    )
+    add = onnx.add_argument
+    add("file", type=Path, metavar="OUT.onnx", help="file to write")
+    add("--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)")
+    add("--height", type=int, default=120, help="sensor rows; the file works for this size only (default: 120)")
+    add("--width", type=int, default=180, help="sensor columns (default: 180)")
+
+
+def _benchmark(command: AddCommand) -> None:
+    benchmark = command(
+        "benchmark",
+        "benchmark.run",
+        "score every method on your own scenes or recordings, or study the event budget",
+        "benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours",
+        "benchmark --recordings pdavis/ --hot-pixels found",
+        "benchmark --event-budget --limit 4",
+        description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
+        "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same on "
+        "recordings of a camera with a polarizer mosaic that hold frames. --event-budget studies the "
+        "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
+    )
+    asked = benchmark.add_mutually_exclusive_group(required=True).add_argument
+    asked("--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included")
+    asked("--recordings", type=Path, metavar="FOLDER", help="HDF5 of E2P, AEDAT-2 and AEDAT4 of a DAVIS with frames")
+    asked("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
+    add = benchmark.add_argument
+    add("--weights", type=Path, metavar="FILE", help="checkpoint (default: the shipped one; of studies the pipeline's)")
+    add(
+        "--kind", choices=("auto", "photographs", "polarization"), default="auto",
+        help="of --scenes; auto recognises .npz and NAME_0, NAME_45, ... as measured polarization (default: auto)",
+    )  # fmt: skip
+    add("--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)")
+    _cleaning(benchmark)
+    add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
+    add("--methods", help="separated by commas (default: benchmark.methods; studies have a list of their own)")
+    add("--limit", type=int, metavar="N", help="use only N pictures of --scenes, or N test sequences")
+    _overrides(benchmark)
+
+
+def _overrides(command: Command) -> None:
+    command.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: sensor=noisy seed=2")
+
+
+def _cleaning(command: Command) -> None:
+    """Options that remove noise from events, which `polarnet.cli.options.cleaning_of` reads."""
+    command.add_argument("--hot-pixels", metavar="found|FILE", help="pixels to remove: those found, or lines `x y`")
+    command.add_argument("--background", metavar="TIME", help="remove events without a neighbour's in TIME: 10ms")
+
+
+def _reading(command: Command) -> None:
+    """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
+    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
+    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
+    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
+    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")

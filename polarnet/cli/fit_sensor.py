@@ -1,0 +1,129 @@
+"""`polarnet fit-sensor`: fit the simulated sensor to a camera's recordings."""
+
+import argparse
+import re
+from pathlib import Path
+
+from polarnet.characterization.fit import SensorFit, fit_sensor
+from polarnet.characterization.known_light import KnownLight
+from polarnet.characterization.light import Flicker, MovingLight, read_light
+from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
+from polarnet.cli.options import reading_of
+from polarnet.cli.project import settings_root, working_folder
+from polarnet.events.stream import Events
+from polarnet.recordings.recording import read_recording
+from polarnet.reports.realism import FitRow, realism_page
+from polarnet.simulation.presets import SENSORS
+
+WRITTEN_BY = "# Written by `polarnet fit-sensor`"
+MIDDLE_DN = 127.5
+UNITS = {
+    "contrast_threshold_on": "log intensity",
+    "contrast_threshold_off": "log intensity",
+    "contrast_threshold_sigma_on": "log intensity",
+    "contrast_threshold_sigma_off": "log intensity",
+    "contrast_threshold_correlation": "",
+    "cutoff_hz": "Hz",
+    "refractory_period_us": "us",
+    "leak_rate_hz": "Hz",
+    "noise_rate_cov_decades": "decades",
+    "leak_jitter": "",
+    "shot_noise_rate_hz": "Hz",
+    "hot_pixel_share": "",
+    "hot_pixel_rate_hz": "Hz",
+}
+"""Unit of each parameter, in the order of the table."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """Fit, print the table, and write the sensor and the page."""
+    check_options(options)
+    preset = _preset_path(options.name)
+
+    def read(path: Path) -> Events:
+        return read_recording(path, part=options.part, **reading_of(options)).events
+
+    static = read(options.static) if options.static else None
+    moving = read(options.moving) if options.moving else None
+    static_light = MIDDLE_DN if options.static_light is None else options.static_light
+    known: list[KnownLight] = []
+    lights: list[tuple[str, Events, MovingLight | Flicker | float]] = []
+    if static is not None:
+        lights.append((f"static: {options.static.name}", static, static_light))
+    if moving is not None and options.frames:
+        known.append(KnownLight("moving", moving, read_light(options.frames, moving.height, moving.width)))
+        lights.append((f"moving: {options.moving.name}", moving, known[-1].light))
+    for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
+        flicker = Flicker(options.flicker_light, options.contrast, frequency_hz)
+        known.append(KnownLight(f"flicker {frequency_hz:g} Hz", read(path), flicker))
+        lights.append((f"flicker: {path.name}", known[-1].events, flicker))
+    fit = fit_sensor(static, static_light, known, [moving] if moving is not None and not options.frames else [])
+    notes = list(fit.notes)
+    if options.static and options.static_light is None:
+        notes.append(
+            f"Brightness of the static recording: {MIDDLE_DN} DN is assumed, so shot noise may be wrong by a factor of "
+            f"up to 2.4; give --static-light"
+        )
+    rows = _rows(fit)
+    for row in [FitRow("parameter", "estimate", "std. error", "from"), *rows]:
+        print(f"{row.parameter:32}{row.estimate:24}{row.error:12}{row.source}".rstrip())
+    for note in notes:
+        print(f"note: {note}")
+    preset.parent.mkdir(parents=True, exist_ok=True)
+    preset.write_text(_preset_text(options.name, fitted_parameters(fit)), encoding="utf-8")
+    sensor = fitted_sensor(fit, SENSORS["default"])
+    comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
+    for comparison in comparisons:
+        print(f"{comparison.name}: {comparison.verdict}")
+    page = Path("outputs", "fit-sensor", f"{options.name}.html")
+    page.parent.mkdir(parents=True, exist_ok=True)
+    page.write_text(realism_page(options.name, rows, notes, comparisons), encoding="utf-8")
+    print(f"sensor      {preset} (use it with sensor={options.name})")
+    print(f"page        {page}")
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """ValueError for options that are missing, or that do not belong together."""
+    if not (options.static or options.moving or options.flicker):
+        raise ValueError("expected a recording; give --static, --moving with --frames, or --flicker")
+    if options.frames and not options.moving:
+        raise ValueError("--frames: expected the recording of these frames; give --moving FILE")
+    if options.static_light is not None and not (options.static and 0 <= options.static_light <= 255):
+        raise ValueError(
+            f"--static-light: expected 0 to 255 DN and --static FILE, got {options.static_light}; white is 255"
+        )
+    files, frequencies = len(options.flicker or []), len(options.frequency or [])
+    if files != frequencies:
+        raise ValueError(
+            f"--frequency: expected one frequency for each of {files} flicker recordings, got {frequencies}"
+        )
+    if bool(files) != (options.contrast is not None):
+        raise ValueError("--contrast: expected the contrast of the flicker, 0 to 1, together with --flicker FILE")
+
+
+def _rows(fit: SensorFit) -> list[FitRow]:
+    rows = []
+    for name, unit in UNITS.items():
+        if one := fit.estimates.get(name):
+            rows.append(FitRow(name, f"{one.value:.4g} {unit}".rstrip(), f"{one.error:.2g}", one.source))
+        else:
+            rows.append(FitRow(name, "not estimated", "", f"{fit.missing[name]}; the default stays"))
+    return rows
+
+
+def _preset_text(name: str, values: dict[str, float]) -> str:
+    """conf/sensor/NAME.yaml: the estimates that differ from the default sensor."""
+    lines = ["# @package _global_", f"{WRITTEN_BY} --name {name}; parameters not named here keep their defaults."]
+    body = [f"  {key}: {value:g}" if value % 1 else f"  {key}: {value:.1f}" for key, value in values.items()]
+    return "\n".join([*lines, *(["emulate:", *body] if body else ["emulate: {}"])]) + "\n"
+
+
+def _preset_path(name: str) -> Path:
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise ValueError(f"--name: expected letters, digits, - and _, got {name!r}")
+    path, shipped = (root / "conf" / "sensor" / f"{name}.yaml" for root in (working_folder(), settings_root()))
+    if shipped.exists() and shipped != path:
+        raise ValueError(f"--name: polarnet has a sensor {name}; choose another name")
+    if path.exists() and WRITTEN_BY not in path.read_text(encoding="utf-8"):
+        raise ValueError(f"--name: {path} exists and was not written by fit-sensor; choose another name")
+    return path

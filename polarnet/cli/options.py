@@ -1,0 +1,51 @@
+"""Values of the options that several commands share."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from polarnet.events.streaming import parse_window
+from polarnet.recordings.noise import FOUND, Cleaning
+
+READING = ("format", "height", "width", "clock_mhz")
+"""Options that describe a camera's file where the file itself does not."""
+CLEANING = ("hot_pixels", "background")
+HOT_FACTOR = 4.0
+"""A pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
+
+
+def reading_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Values of `READING`."""
+    return {name: getattr(options, name) for name in READING}
+
+
+def cleaning_of(options: argparse.Namespace) -> Cleaning:
+    """Noise to remove; ValueError for a background that is not a time."""
+    hot = options.hot_pixels
+    if hot not in (None, FOUND):
+        hot = str(Path(hot).resolve())
+        if not Path(hot).is_file():
+            raise FileNotFoundError(f"--hot-pixels {options.hot_pixels}: expected {FOUND} or a file, there is none")
+    return Cleaning(hot, HOT_FACTOR, duration_us(options, "background", "10ms"))
+
+
+def duration_us(options: argparse.Namespace, name: str, example: str) -> int | None:
+    """Option --NAME as a time in microseconds; None if it is not given, ValueError for anything but a time."""
+    text = getattr(options, name)
+    time_us, _ = parse_window(text) if text else (None, None)
+    if text and time_us is None:
+        raise ValueError(f"--{name}: expected a time such as {example}, got {text}")
+    return time_us
+
+
+def given(options: argparse.Namespace, names: Sequence[str]) -> str:
+    """Those of the options `names` that have a value, as on the command line: --size, --fps."""
+    named = (name for name in names if getattr(options, name) is not None and getattr(options, name) is not False)
+    return ", ".join(f"--{name.replace('_', '-')}" for name in named)
+
+
+def refuse(options: argparse.Namespace, kind: str, names: Sequence[str]) -> None:
+    """ValueError for a value of the options `names`, which have no meaning for inputs of a kind."""
+    if listed := given(options, names):
+        raise ValueError(f"{kind}: expected no {listed}, which does not apply to this input; leave it out")

@@ -1,0 +1,146 @@
+"""`polarnet recover`: DoLP and AoLP of recordings or of a running camera."""
+
+import argparse
+import functools
+import sys
+from pathlib import Path
+
+from polarnet.cli.commands import BESIDE
+from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, reading_of, refuse
+from polarnet.cli.outputs import WORK, run_folder
+from polarnet.cli.project import settings_root
+from polarnet.config.pipeline import setup_of
+from polarnet.config.tree import Config, load
+from polarnet.events.rotation import Rotation
+from polarnet.events.streaming import WindowRule, parse_window
+from polarnet.methods import METHODS
+from polarnet.recordings.noise import Cleaner
+from polarnet.recordings.polarizers import ChannelCheck
+from polarnet.recordings.recording import detect_format, read_recording
+from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
+from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
+from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
+from polarnet.recovery.writer import RecoveryWriter
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
+from polarnet.storage.events import EventStore
+from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
+
+DEFAULT_METHOD, ROTATING_METHOD = "ours", "rotating_polarizer"
+RECONSTRUCT = "highpass"
+"""Method whose intensities are the S0 of the video."""
+NETWORK_WINDOW = "33.333ms"
+ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
+"""Options that say where the polarizers are."""
+NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", *READING)
+NOT_ROTATING = (
+    "angles", "mosaic", "sequence", "truth", "rate", "method", "weights", "thresholds", "binning", "window", *CLEANING,
+)  # fmt: skip
+"""Options without a meaning for live input, and for one camera behind a rotating polarizer."""
+
+
+def run(options: argparse.Namespace) -> None:
+    """Recover, write the files and print facts about the input and the result."""
+    check_options(options)
+    config = load(settings_root(), [f"runtime.device={options.device}"])
+    setup = functools.partial(setup_of, config)
+    source, rotation, rule = _rotating(options)
+    method = options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD)
+    settings = options.weights, options.precision, options.thresholds, options.binning, rotation
+    recoverer, words = open_method(ChosenMethod(method, *settings), setup)
+    rate = None
+    if options.rate is not None:
+        check_rate(options.rate, rule, recoverer)
+        rate = Rate(options.rate, config.between.with_thresholds(options.thresholds))
+    truth = _truth_of(options)
+    scores = TruthScores(truth) if truth else None
+    out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
+    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
+    cleaner = Cleaner(cleaning_of(options), mosaic)
+    with run_folder(out, "recover") as folder:
+        if options.live:
+            print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
+        source = source or _input(options, mosaic, cleaner, folder / WORK, config)
+        check, polarized = None, source.channels == len(POLARIZER_ANGLES_DEG)
+        if polarized:
+            check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
+            source = source._replace(pieces=check.watch(source.pieces))
+        drawn = polarized and "mp4" in options.write and truth is None
+        reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
+        writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
+        frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
+        if scores:
+            frames = scores.watch(frames)
+        facts = recover(source, rule, words, writer, frames)
+        if rate:
+            facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
+        if check:
+            counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
+            facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if scores:
+            facts["scores"] = scores.sentence(config.benchmark.warmup_windows)
+        if given(options, CLEANING):
+            facts["removed"] = cleaner.sentence()
+        notes = check.findings() if check else []
+        if left_out := {kind: count for kind, count in (source.left_out or {}).items() if count}:
+            notes.append(f"Unusable lines were left out: {left_out}.")
+        page = writer.write_page(source.name, facts, notes)
+    for key, value in facts.items():
+        print(f"{key:11s} {value}")
+    for note in notes:
+        print(f"polarnet recover: warning: {note}", file=sys.stderr)
+    print(f"page        {out / page.name}")
+
+
+def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | None, WindowRule]:
+    """Input and rotation of one camera behind a rotating polarizer, None for any other input; and the windows."""
+    step_us = duration_us(options, "step", "0.1ms")
+    if options.rotating is None and options.triggers is None:
+        return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
+    rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
+    read = functools.partial(read_recording, **reading_of(options))
+    source, rotation = open_rotating(Path(options.input[0]), rotation, read, options.size)
+    return source, rotation, half_turn_rule(rotation, step_us)
+
+
+def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner, work: Path, config: Config) -> Input:
+    """Cleaned events of live input, or of files with the arrangement that the options state."""
+    if options.live:
+        source = open_live(options.input[0], mosaic, options.idle)
+        return source._replace(pieces=cleaner.live(source.pieces))
+    method = METHODS.get(options.method)
+    plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
+    read = functools.partial(read_recording, **reading_of(options))
+    paths = [Path(path) for path in options.input]
+    files = Files(paths, options.angles, mosaic, options.sequence, plain, read, config.recordings)
+    return open_files(files, work, options.size, cleaner)
+
+
+def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
+    """True frames of option --truth; ValueError if the input is not a store with them."""
+    if options.truth is None:
+        return None
+    path = options.input[0]
+    if options.size or detect_format(Path(path)) != "store":
+        raise ValueError("--truth: expected an event store in its own size; leave out --truth or --size")
+    truth = truth_beside(path) if options.truth == BESIDE else options.truth
+    if truth is None:
+        raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {path}, there is none; name them")
+    return open_truth(truth, options.sequence or EventStore.open(path).sequences[0])
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """ValueError for options that do not belong together, or that the input would not use."""
+    stated = [name for name in ARRANGEMENTS if getattr(options, name) is not None]
+    if len(stated) > 1 and stated != ["rotating", "triggers"]:
+        raise ValueError(f"expected one arrangement of polarizers, got {given(options, stated)}")
+    rotating = "rotating" in stated or "triggers" in stated
+    if options.live:
+        refuse(options, "--live", NOT_LIVE)
+    if rotating:
+        refuse(options, "--rotating", NOT_ROTATING)
+    else:
+        refuse(options, "without --rotating or --triggers", ["start_angle"])
+    if (options.live or rotating) and len(options.input) != 1:
+        raise ValueError(f"{'--live' if options.live else '--rotating'}: expected one input, got {len(options.input)}")
+    if Path(options.input[0]).is_dir():
+        refuse(options, "a store or a folder", READING)
