@@ -36,7 +36,10 @@ def stores(tmp_path_factory, config):
     images = root / "images"
     images.mkdir()
     write_png(images / "leaf.png", dead_leaves(generator_for(1, "leaf", "picture"), 200, 300), bits=8)
-    entry = ManifestEntry("leaf", "leaf.png", "test", "dead_leaves", "", "0" * 64, 8, 200, 300, 200, 300)
+    entry = ManifestEntry(
+        name="leaf", file="leaf.png", split="test", source="dead_leaves", origin="", sha256="0" * 64, bits=8,
+        height=200, width=300, source_height=200, source_width=300,
+    )  # fmt: skip
     write_manifest(Manifest((entry,), (), 0, 0), images)
     synthesize(Synthesis(images, config.synthesize, config.seed, 2), root / "scenes.zarr", root / "frames.zarr", map)
     emulate_scenes(root / "scenes.zarr", root / "events.zarr", config.camera, config.seed, map, 1)
