@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Int
 
 from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events, select, slice_time
+from polarnet.events.stream import Events, select
 from polarnet.recordings.live import Piece
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.stokes import Mosaic
 
 FOUND = "found"
 NEVER = np.iinfo(np.int64).min // 2
@@ -25,8 +25,6 @@ NEIGHBOURHOOD = 5  # side of a square, in pixels
 HOT_FACTOR = 4.0  # default of the commands
 MIN_HOT_HZ = 20.0  # slower pixels are harmless in a scene
 MIN_EVENTS = 8  # fewer events are no evidence
-DISTURBING_HZ = 10_000.0  # events a second of a pixel; more change the shipped network's DoLP far from the pixel
-CHECKED_US = 1_000_000
 
 
 class Cleaning(NamedTuple):
@@ -96,41 +94,6 @@ class Cleaner:
             return listed
         row, column = places_of(self._mosaic)[channel]
         return listed[row::2, column::2]
-
-
-class ChannelCheck:
-    """Counts the events of a recording's four channels as they pass through `watch`; `findings` reports problems."""
-
-    def __init__(self, height: int, width: int):
-        self.counts = [0, 0, 0, 0]
-        """Number of events in each channel."""
-        self._early = np.zeros((4, height, width), np.int64)
-        self._checked_us = 0
-
-    def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
-        """Pass the pieces on unchanged, counting the events of each pixel in the first second."""
-        for piece in pieces:
-            self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
-            if self._checked_us < CHECKED_US:
-                self._early += [event_counts(slice_time(events, 0, CHECKED_US)) for events in piece.channels]
-                self._checked_us = min(piece.until_us, CHECKED_US)
-            yield piece
-
-    def findings(self) -> list[str]:
-        """Problems found, a sentence each: channels without events, and hot pixels that disturb the whole image."""
-        seconds = self._checked_us * 1e-6
-        findings = [
-            f"There are no events behind the polarizer at {angle} degrees. DoLP and AoLP are wrong."
-            for angle, count in zip(POLARIZER_ANGLES_DEG, self.counts, strict=True)
-            if count == 0
-        ]
-        hot = np.stack([hot_pixels(counts, seconds, HOT_FACTOR) for counts in self._early])
-        if disturbing := int((hot & (self._early > DISTURBING_HZ * seconds)).sum()):
-            findings.append(
-                f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the "
-                f"whole image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
-            )
-        return findings
 
 
 def event_counts(events: Events) -> Int[np.ndarray, "h w"]:

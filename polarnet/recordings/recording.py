@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 
-from polarnet.events.stream import Events, concatenate
+from polarnet.events.stream import MAX_SIDE, Events, concatenate
 from polarnet.recordings.formats import aedat2, celex5, faery, hdf5, lines, prophesee, rosbag, store
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import REPAIRS, Block, CameraFrames, Choices, RecordingError, Source, joined
@@ -114,6 +114,9 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
+    for name, side in (("height", height), ("width", width)):
+        if side is not None and not 0 < side <= MAX_SIDE:
+            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
     if chunk_events < 1:
         raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
     if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:

@@ -9,7 +9,6 @@ import torch
 from polarnet.events.stream import Events, merge, slice_time
 from polarnet.recordings.live import Piece
 from polarnet.recordings.noise import (
-    ChannelCheck,
     Cleaner,
     Cleaning,
     event_counts,
@@ -115,19 +114,3 @@ def test_other_lines_of_hot_pixels_are_refused(tmp_path, line, message):
     (tmp_path / "hot.txt").write_text(f"0 0\n{line}\n")
     with pytest.raises(ValueError, match=message):
         read_hot_pixels(tmp_path / "hot.txt", 3, 4)
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "sentences"),
-    [(5_000, []), (20_000, ["Hot pixels with more than 10,000 events a second: 1. DoLP is wrong in the whole image"])],
-)
-def test_a_hot_pixel_that_disturbs_the_whole_image_and_a_silent_channel_are_named(make_events, rate_hz, sentences):
-    hot = make_events([(t, 8, 8, 1) for t in range(0, 200_000, 1_000_000 // rate_hz)], 16, 16)
-    one = make_events([(0, 3, 8, 1)], 16, 16)
-    for last, silent in ((one, []), (make_events([], 16, 16), ["There are no events behind the polarizer at 135 deg"])):
-        check = ChannelCheck(16, 16)
-        piece = Piece([hot, one, one, last], 200_000, 0.0)
-        assert list(check.watch([piece])) == [piece]
-        assert check.counts == [len(hot), 1, 1, len(last)]
-        for finding, expected in zip(check.findings(), silent + sentences, strict=True):
-            assert finding.startswith(expected)

@@ -103,7 +103,7 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         open_recording(tmp_path / "nothing.csv")
     (tmp_path / "e.txt").write_text("5 1 2 1\n")
     for arguments, message in (
-        ({"height": 0, "width": 4}, "expected a sensor with sides of 1 to 32767 px, got 0x4"),
+        ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
         ({"chunk_events": 0}, "at least one event"),
         ({"clock_mhz": 0.0}, r"a clock of 0\.001 to 10000 MHz"),
         ({}, "give height and width"),

@@ -89,7 +89,6 @@ def test_a_mosaic_is_one_file_with_channels_of_half_its_size(make_channel, tmp_p
     options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
     assert run(whole, *options, out=tmp_path / "out") == 0
     assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
-    assert re.search(r"events +\d+ at 0, \d+ at 45, \d+ at 90, \d+ at 135 degrees", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -242,6 +241,25 @@ def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store,
     (tmp_path / "out" / "run.json").unlink()
     assert main([*arguments, "png", "--window", "50ms"]) == 1
     assert "contains files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
+
+
+def test_a_mosaic_without_polarizers_is_named_on_the_terminal_and_on_the_page(tmp_path, at_root, capsys):
+    """Every pixel fires at once in a random pattern of edges, whatever its place in a cell."""
+    generator = np.random.default_rng(2)
+    t = np.repeat(np.arange(0, 330_000, 1000), 60)
+    cells = generator.integers(0, (40, 60), (len(t), 2))
+    p = generator.choice([-1, 1], len(t))
+    y, x, t, p = (np.repeat(values, 4) for values in (2 * cells[:, 0], 2 * cells[:, 1], t, p))
+    y, x = y + np.tile([0, 0, 1, 1], len(cells)), x + np.tile([0, 1, 0, 1], len(cells))
+    keep = generator.random(len(t)) < 0.9  # pixels do not fire alike to the last event
+    columns = (t[keep], x[keep].astype(np.int16), y[keep].astype(np.int16), p[keep].astype(np.int8))
+    camera = write_lines(tmp_path / "camera.txt", Events(*map(torch.from_numpy, columns), 80, 120))
+    out = tmp_path / "out"
+    assert run(camera, "--mosaic", "90 45 / 135 0", "--method", "highpass", out=out) == 0
+    printed = capsys.readouterr()
+    assert "warning: The four channels show the same" in printed.err
+    assert re.search(r"events +[\d,]+ at 0, [\d,]+ at 45, [\d,]+ at 90, [\d,]+ at 135 degrees", printed.out)
+    assert "was made without polarizers" in (out / "index.html").read_text()
 
 
 def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, capsys):
