@@ -18,7 +18,7 @@ from polarnet.benchmark.paired import paired_comparisons
 from polarnet.benchmark.run import Benchmark
 from polarnet.benchmark.score import METRICS, BenchmarkConfig, Cost, FrameScore, scene_means, summary, write_frames
 from polarnet.metrics.reliability import Reliability
-from polarnet.runtime.files import check_seal, seal
+from polarnet.runtime.files import check_seal, publish, seal
 from polarnet.storage.panels import read_panel, write_panel
 
 MADE_BY = "run `dvc repro`, or `python -m stages.row` for all rows"
@@ -27,6 +27,7 @@ MADE_BY = "run `dvc repro`, or `python -m stages.row` for all rows"
 class RowRecord(NamedTuple):
     """Content of row.json."""
 
+    row: str
     left_out: str | None
     """Reason why the row could not run; None if it ran."""
     weights: Mapping[str, Mapping[str, str]]
@@ -34,7 +35,8 @@ class RowRecord(NamedTuple):
 
 
 def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benchmark]) -> None:
-    """Write `folder` anew with the results of `row` on each set; row.json comes last and marks the folder complete."""
+    """Publish `folder` with the results of `row` on each set."""
+    place, folder = folder, folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, benchmark in sets.items():
@@ -50,14 +52,21 @@ def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benc
             write_panel(folder / name / "panels", panel, [row])
     (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
     seal(folder)
+    publish(folder, place)
 
 
 def read_record(folder: Path) -> RowRecord:
-    """Content of row.json; FileNotFoundError if the row was not run, ValueError if a file of the folder has changed."""
+    """Content of row.json; FileNotFoundError if the row was not run, ValueError if the folder has another row's files.
+
+    ValueError, too, if a file of the folder has changed.
+    """
     if not (folder / "row.json").exists():
         raise FileNotFoundError(f"{folder / 'row.json'} is missing: row {folder.name} was not run; {MADE_BY}")
     check_seal(folder)
-    return RowRecord(**json.loads((folder / "row.json").read_text()))
+    record = RowRecord(**json.loads((folder / "row.json").read_text()))
+    if record.row != folder.name:
+        raise ValueError(f"{folder}: expected row {folder.name}, got a copy of row {record.row}; {MADE_BY}")
+    return record
 
 
 def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:

@@ -104,7 +104,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     if options.recordings:
         left_out |= {row: NOT_ROTATING for row in methods if is_rotating(row)}
         methods = [row for row in methods if row not in left_out]
-    settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK
+    settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
             used = configured(config.synthesize, config.emulate)
@@ -151,7 +151,7 @@ def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: 
 
 def _rotating_events(config: Config, work: Path) -> Path:
     """Emulate the scenes behind a rotating polarizer; returns the path of the events."""
-    events, mapper = work / "rotating.zarr", config.mapper("emulate_rotating")
+    events, mapper = work.with_name("rotating.zarr"), config.mapper("emulate_rotating")
     emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
     return events
 

@@ -5,8 +5,7 @@ import re
 from pathlib import Path
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
-from polarnet.characterization.known_light import KnownLight
-from polarnet.characterization.light import Flicker, MovingLight, read_light
+from polarnet.characterization.light import Flicker, KnownLight, MovingLight, read_light
 from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder

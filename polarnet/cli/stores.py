@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from polarnet.cli.options import HOT_FACTOR, reading_of
+from polarnet.config.origins import origin_problems
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
@@ -17,10 +18,10 @@ from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
 from polarnet.reports.recordings import draw_hot_pixels, recording_picture
 from polarnet.reports.viewing import films_of
-from polarnet.runtime.files import SUMS, changed_files
+from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, SplitStore
-from polarnet.storage.groups import open_group
+from polarnet.storage.groups import is_url, open_group
 from polarnet.storage.parts import Store, unknown_sequence
 from polarnet.storage.scenes import SceneStore
 from polarnet.storage.true_frames import open_truth, truth_beside
@@ -114,8 +115,8 @@ def verified(path: str) -> Iterator[tuple[str, list[str]]]:
     else:
         for place, folders, files in os.walk(path):
             here = Path(place)
-            if SUMS in files:
-                yield place, changed_files(here)
+            if {SUMS, ORIGIN} & {*files}:
+                yield place, [*(changed_files(here) if SUMS in files else ()), *origin_problems(here)]
             for store in sorted(name for name in folders if name.endswith(".zarr")):
                 yield str(here / store), _store_problems(str(here / store))
             folders[:] = sorted(name for name in folders if not name.endswith((".zarr", *UNFINISHED)))
@@ -129,7 +130,7 @@ def _store_problems(path: str) -> list[str]:
         kind = _kind_of(path)
     except (FileNotFoundError, ValueError) as error:
         return [str(error)]
-    return kind.verify(path)
+    return [*kind.verify(path), *([] if is_url(path) else origin_problems(Path(path)))]
 
 
 def _file_problems(file: Path) -> list[str]:

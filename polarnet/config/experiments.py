@@ -10,6 +10,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
@@ -22,6 +23,8 @@ MAPPINGS = ("randomise",)
 GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
+BEYOND_VALUES = re.compile(r"\$\{|^\s*#\s*@package", re.MULTILINE)
+MAX_ALIASES = 16  # nested, sixteen can double a list often enough to show, not to fill the memory
 
 
 class WithNulls(RoundTripRepresenter):
@@ -118,6 +121,7 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
     The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
     lists the available keys and choices.
     """
+    _check_params(settings, root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:
         key, _, value = override.partition("=")
@@ -126,6 +130,22 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
             _check_choices([root, presets] if presets else [root], key, value)
         elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(settings, key.split("."))):
             raise ValueError(refusal)
+
+
+def _check_params(settings: type, file: Path) -> None:
+    """ValueError if a params.yaml holds more than values: it may come from a stranger, and Hydra reads it whole.
+
+    A key `hydra` could make Hydra write into any file, an interpolation could print a secret, a comment `@package`
+    could move the file elsewhere, and a few aliases of aliases make billions of values.
+    """
+    text = file.read_text(encoding="utf-8")
+    if found := BEYOND_VALUES.search(text):
+        raise ValueError(f"{file}: expected plain values without Hydra's {found[0].strip()!r}; remove it")
+    if sum(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)) > MAX_ALIASES:
+        raise ValueError(f"{file}: expected at most {MAX_ALIASES} aliases; write their values out")
+    for key in YAML(typ="safe", pure=True).load(text) or {}:
+        if refusal := unknown_key(settings, [str(key)]):
+            raise ValueError(f"{file}: {refusal}")
 
 
 def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:

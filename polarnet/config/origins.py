@@ -227,6 +227,17 @@ def read_origin(folder: Path) -> Origin | None:
     raise ValueError(f"{file} is not as it was written; {REMAKE}")
 
 
+def origin_problems(folder: Path) -> list[str]:
+    """Why the files of a folder are not those of its origin; empty if they are, or if it keeps none."""
+    try:
+        origin = read_origin(folder)
+    except ValueError as error:
+        return [str(error)]
+    if origin is None or origin.content == digest([folder]):
+        return []
+    return [f"{folder}: its files are not those that {folder / ORIGIN} describes; {REMAKE}"]
+
+
 def _checksum(content: Mapping[str, Any]) -> str:
     return sha256(json.dumps(content, sort_keys=True).encode())
 

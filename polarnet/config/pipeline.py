@@ -105,7 +105,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
     methods, left_out = available(rows, context)
     for row, reason in left_out.items():
         print(f"{row} is left out: {reason}")
-        write_row(row_folder(config, row), row, RowRecord(reason, {}), {})
+        write_row(row_folder(config, row), row, RowRecord(row, reason, {}), {})
     if not methods:
         return
     lpips = or_exit(lambda: lpips_of(config))
@@ -116,7 +116,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
             results[name] = run_benchmark(test_set, context, settings, lpips, config.mapper(name))
     for row in methods:
         own = {name: benchmark for name, benchmark in results.items() if row in benchmark.costs}
-        write_row(row_folder(config, row), row, RowRecord(None, weights_used([row], context)), own)
+        write_row(row_folder(config, row), row, RowRecord(row, None, weights_used([row], context)), own)
 
 
 def lpips_of(config: Config) -> Lpips | None:

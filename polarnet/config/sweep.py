@@ -1,4 +1,4 @@
-"""Table at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
+"""Table and plot at the end of a Hydra multirun of trials: points ranked by validation MSE, seeds averaged."""
 
 import csv
 import json
@@ -11,7 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.config.origins import first_difference
-from polarnet.training.engine.history import HISTORY, best_row, read_history
+from polarnet.training.engine.recorder import HISTORY, best_row, read_history
 
 FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
@@ -22,7 +22,7 @@ SCORES = {"validation": ("mse", "psnr"), "test": ("mse", "psnr", "ssim", "lpips"
 
 
 class SweepTable(Callback):
-    """Writes comparison.csv into the sweep's folder and prints the ranking (conf/config.yaml)."""
+    """Writes comparison.csv and comparison.png into the sweep's folder and prints the ranking (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Collect the trials and write their table; a sweep of another entry point has no trials and gets no table.
@@ -35,6 +35,8 @@ class SweepTable(Callback):
             return
         rows = sweep_rows(points)
         write_csv(rows, folder / "comparison.csv")
+        if axes := swept_axes(rows):
+            (folder / "comparison.png").write_bytes(_plot(*axes))
         print(f"\n{ranking(rows)}\nAll scores: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
@@ -108,6 +110,27 @@ def _mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[s
         if values and len(values) == len(scores):
             means[name] = {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None}
     return means
+
+
+def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float]] | None:
+    """Values of the keys that differ between finished rows, and their validation MSE; None if no key differs."""
+    done = [row for row in rows if row["validation"]]
+    given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
+    keys = [
+        key for key in dict.fromkeys(key for one in given for key in one) if len({one.get(key) for one in given}) > 1
+    ]
+    if not keys:
+        return None
+    return {key: [one.get(key, "-") for one in given] for key in keys}, [
+        row["validation"]["mse"]["mean"] for row in done
+    ]
+
+
+def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes:
+    from polarnet.reports.charts import parallel_coordinates  # every stage imports this module, and only a sweep draws
+    from polarnet.reports.maps import png
+
+    return png(parallel_coordinates(values, scores, "validation MSE"))
 
 
 def ranking(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -90,8 +90,8 @@ def dolp_recoverer(
 
 def _told(network: StokesUNet, thresholds: Sequence[float]) -> Encode:
     """Give a network the mean of the camera's thresholds; each event counts as its threshold over this mean."""
-    if min(thresholds) <= 0:
-        raise ValueError(f"thresholds: expected numbers above 0 (ON, OFF), got {list(thresholds)}")
+    if not all(0.001 <= threshold <= 10 for threshold in thresholds):
+        raise ValueError(f"thresholds: expected 0.001 to 10 in natural-log intensity (ON, OFF), got {list(thresholds)}")
     mean = math.sqrt(math.prod(thresholds))
     network.scale.given = mean / network.step
     return weighted_counts([threshold / mean for threshold in thresholds])

@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import nn
 
+from polarnet.events.representations import REPRESENTATIONS
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.networks.polarnet.stokes_unet import StokesUNetConfig
@@ -14,6 +15,9 @@ NetworkConfig = DolpUNetConfig | StokesUNetConfig
 
 NETWORKS: dict[str, type[NetworkConfig]] = {"paper": DolpUNetConfig, "polarnet": StokesUNetConfig}
 """Class of each network's section in params.yaml, which names the network's own class."""
+
+
+MAX_CHANNELS = 1024  # of the input; a hostile file could ask for any
 
 
 def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any]]:
@@ -25,17 +29,23 @@ def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any
     'polarnet'
     """
     tensors, metadata = load_checkpoint(path)
-    if metadata["network"] not in NETWORKS:
+    if metadata.get("network") not in NETWORKS:
         raise ValueError(
-            f"{path} holds a {metadata['network']!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
+            f"{path} holds a {metadata.get('network')!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
+        )
+    inputs, representation = metadata.get("in_channels"), metadata.get("representation")
+    if not isinstance(inputs, int) or not 0 < inputs <= MAX_CHANNELS or representation not in REPRESENTATIONS:
+        raise ValueError(
+            f"{Path(path).with_suffix('.json')}: expected in_channels of 1 to {MAX_CHANNELS} and a representation of "
+            f"{', '.join(REPRESENTATIONS)}, got {inputs!r} and {representation!r}; train again"
         )
     try:
         config = NETWORKS[metadata["network"]](**metadata["config"])
-    except ValueError as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{Path(path).with_suffix('.json')}: config of another version of networks.{metadata['network']}: "
-            f"{error}; edit the JSON, or train again"
+            f"{error}; train again"
         ) from None
-    network = config.network_class(config, metadata["in_channels"])
+    network = config.network_class(config, inputs)
     load_tensors(network, tensors, path)
     return network.eval(), metadata

@@ -127,7 +127,18 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
             done = time.perf_counter()
             for k, window in enumerate(windows):
                 frame = each_map(maps, operator.itemgetter(k))
+                _check_finite(frame, window)
                 yield Frame(window, frame, (done - start) / len(windows), done - piece.read_at)
+
+
+def _check_finite(frame: Prediction, window: EventWindow) -> None:
+    """ValueError for a DoLP with NaN or infinity, but for a camera without polarizers, which has none."""
+    plain = frame.intensities is not None and len(frame.intensities) == 1
+    if not plain and not frame.dolp.isfinite().all():
+        raise ValueError(
+            f"the DoLP of the window from {window.start_us} to {window.stop_us} us is not finite: the weights or the "
+            "thresholds are no working ones; the frames before it are whole"
+        )
 
 
 def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:

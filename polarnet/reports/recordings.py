@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
-from polarnet.captures.calibration import Alignment
+from polarnet.captures.alignment import Alignment
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import Calibrated
 from polarnet.events.representations import event_tensor, polarity_sums

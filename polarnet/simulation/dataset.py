@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from polarnet import __version__
 from polarnet.events.stream import Events, slice_time
 from polarnet.simulation.camera import Camera, channel_size
 from polarnet.simulation.motion import Trajectory
@@ -39,9 +38,8 @@ def emulate_scenes(
 
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
-    """All settings and data that determine the events of a scene store."""
-    origin = {"seed": seed, "scenes": scenes.attributes, "polarnet": __version__}  # other versions are not resumed
-    return {**camera.sections, **origin}
+    """All settings and data that determine the events of a scene store; its checksum stands for its pixels."""
+    return {**camera.sections, "seed": seed, "scenes": scenes.attributes, "scenes_sha256": scenes.header["checksum"]}
 
 
 def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:

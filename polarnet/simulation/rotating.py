@@ -1,9 +1,7 @@
 """Events of one sensor behind a polarizer that rotates in front of it: one channel with weights in time."""
 
 import functools
-import json
 import math
-import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -85,17 +83,12 @@ def emulate_rotating_scenes(
 ) -> int:
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
-    Events are in the store's first channel; the other three are empty. A store of the same scenes and settings is kept,
-    any other is replaced. `mapper` is as in `dataset.emulate_scenes`.
+    Events are in the store's first channel; the other three are empty. `mapper` is as in `dataset.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
     height, width, _ = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
     names = source.of_split("test")
-    if events.exists():
-        if EventStore.open(events).attributes == json.loads(json.dumps(attributes)):
-            return len(names)
-        shutil.rmtree(events)
     store = EventStore.create(events, names, height, width, attributes, source.sequences_per_part)
     task = functools.partial(_emulate_part, scenes=source, events=store, rotating=rotating, camera=camera, seed=seed)
     for _ in mapper(task, store.missing_parts()):

@@ -18,7 +18,7 @@ from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement
-from polarnet.runtime.files import changed_files, seal, sha256
+from polarnet.runtime.files import changed_files, code_digest, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
@@ -102,10 +102,10 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures; False if it is complete.
 
     `fill` writes the pictures into a folder, and `source` is the hash of its input. A folder made with other settings
-    or input is emptied first, as is one whose files have changed since, with a warning. DVC notices changes of code.
+    or input, or by other code, is emptied first, as is one whose files have changed since, with a warning.
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
-    settings = sections | {"seed": recipe.seed, "source": source}
+    settings = sections | {"seed": recipe.seed, "source": source, "code": code_digest()}
     key = sha256(json.dumps(settings, sort_keys=True).encode())
     note = folder / MADE
     if note.exists():

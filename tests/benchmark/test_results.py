@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 
 import pytest
 
@@ -21,7 +22,7 @@ def benchmark(five_scenes, make_context, brief_costs):
 
 def written(folder, benchmark, rows=ROWS):
     for row in rows:
-        write_row(folder / row, row, RowRecord(None, {}), {"simulated": benchmark})
+        write_row(folder / row, row, RowRecord(row, None, {}), {"simulated": benchmark})
     return {row: folder / row for row in rows}
 
 
@@ -67,6 +68,17 @@ def test_rows_of_different_sequences_make_no_table(benchmark, tmp_path):
 
 
 def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(benchmark, tmp_path):
-    write_row(tmp_path / "cf", "cf", RowRecord(None, {}), {"simulated": benchmark, "measured": benchmark})
+    write_row(tmp_path / "cf", "cf", RowRecord("cf", None, {}), {"simulated": benchmark, "measured": benchmark})
     written(tmp_path, benchmark, ["cf"])
     assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["SHA256SUMS", "row.json", "simulated"]
+
+
+def test_the_folder_of_another_row_and_a_row_without_a_seal_are_refused(benchmark, tmp_path):
+    folders = written(tmp_path, benchmark, ["cf", "zeros"])
+    shutil.rmtree(folders["cf"])
+    shutil.copytree(folders["zeros"], folders["cf"])
+    with pytest.raises(ValueError, match="cf: expected row cf, got a copy of row zeros; run `dvc repro`"):
+        read_record(folders["cf"])
+    (folders["zeros"] / "SHA256SUMS").unlink()
+    with pytest.raises(ValueError, match="SHA256SUMS is missing, so that nothing says whether"):
+        read_record(folders["zeros"])

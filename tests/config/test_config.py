@@ -112,6 +112,23 @@ def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
         load(project)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("hydra: {job_logging: {handlers: {x: {class: logging.FileHandler, filename: precious.txt}}}}", "hydra is not"),
+        ("defaults: [other]", "defaults is not a setting"),
+        ("seed: ${oc.env:SECRET}", r"expected plain values without Hydra's '\$\{'; remove it"),
+        ("# @package hydra.run\nseed: 1", "expected plain values without Hydra's '# @package'; remove it"),
+        ("\n".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9 if n else 'x' * 9)}]" for n in range(9)), "16 aliases"),
+    ],
+    ids=["logging", "defaults", "interpolation", "package", "aliases"],
+)
+def test_a_params_yaml_with_more_than_values_is_refused_before_hydra_reads_it(project, text, message):
+    (project / "params.yaml").write_text(f"{text}\n")
+    with pytest.raises(ValueError, match=message):
+        load(project)
+
+
 def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a_queued_experiment_where_they_are(
     project_root, tmp_path, monkeypatch
 ):

@@ -128,7 +128,8 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         header = f"% Version 2\n% Height {events.height}\n% Width {events.width}\n".encode()
         path.write_bytes(header + b"\x0c\x08" + words.astype("<u4").tobytes())
     elif form == "aedat2":
-        address = (events.height - 1 - events.y.long()) << 22 | events.x.long() << 12 | (events.p > 0).long() << 11
+        x, y = events.width - 1 - events.x.long(), events.height - 1 - events.y.long()  # events count from the right
+        address = y << 22 | x << 12 | (events.p > 0).long() << 11
         header = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n"
         path.write_bytes(header + np.stack([address, events.t], axis=1).astype(">u4").tobytes())
     elif form == "celex5_csv":

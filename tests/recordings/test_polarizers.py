@@ -97,9 +97,9 @@ def test_a_hot_pixel_changes_nothing(polarized):
     one = torch.full_like(t, 7).to(torch.int16)
     hot = Events(t, one, one, torch.ones_like(t).to(torch.int8), polarized[0].height, polarized[0].width)
     bad = np.zeros((4, hot.height, hot.width), bool)
-    before, _ = pair_misfits(windows_of(polarized), bad)
+    before, _ = pair_misfits(windows_of(polarized), [*bad])
     bad[0, 7, 7] = True
-    after, _ = pair_misfits(windows_of([merge([polarized[0], hot]), *polarized[1:]]), bad)
+    after, _ = pair_misfits(windows_of([merge([polarized[0], hot]), *polarized[1:]]), [*bad])
     np.testing.assert_allclose(after, before, rtol=0.01)
 
 

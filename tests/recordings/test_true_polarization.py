@@ -92,7 +92,7 @@ HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r
 
 def write_aedat2(path, frames, events=()):
     words = [samples(raw, start, stop) for raw, start, stop in frames]
-    words += [np.array([[(259 - y) << 22 | x << 12 | p << 11, t]]) for t, x, y, p in events]
+    words += [np.array([[(259 - y) << 22 | (345 - x) << 12 | p << 11, t]]) for t, x, y, p in events]
     entries = np.concatenate(words)
     path.write_bytes(HEADER + entries[np.argsort(entries[:, 1], kind="stable")].astype(">u4").tobytes())
     return path

@@ -15,6 +15,7 @@ from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.reports.artefacts import ReportPaths
+from polarnet.runtime.files import seal
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import Prediction
@@ -118,6 +119,7 @@ def data(tmp_path_factory):
         folder.mkdir(parents=True)
         write_history(folder, HISTORY)
         (folder / "best.json").write_text(json.dumps({"network": network}))
+        seal(folder)
     return data
 
 

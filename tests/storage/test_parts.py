@@ -164,6 +164,27 @@ def test_an_unfinished_store_is_resumed_under_an_equal_header_and_removed_under_
     assert Numbers.create_parts(tmp_path / "store.zarr", NAMES, {"seed": 2}, 3).missing() == NAMES
 
 
+def test_an_unfinished_store_of_other_code_is_not_resumed_and_a_finished_one_does_not_name_it(
+    finished, tmp_path, monkeypatch
+):
+    write(store_at(tmp_path / "store.zarr"), "s4")
+    monkeypatch.setattr(parts_module, "code_digest", lambda: "of an edited polarnet")
+    assert store_at(tmp_path / "store.zarr").missing() == NAMES
+    write_missing_and_finish(tmp_path / "store.zarr")
+    assert files_of(tmp_path / "store.zarr") == files_of(finished)
+
+
+@pytest.mark.parametrize("name", ["/tmp/outside", "../outside", "..", "a/b"])
+def test_a_store_whose_sequence_could_be_written_elsewhere_is_refused(copy, name):
+    header = json.loads((copy / "zarr.json").read_text())["attributes"]
+    names = [*NAMES[:-1], name]
+    checksum = parts_module._checksum({**header, "sequences": names})
+    with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
+        Numbers.open(with_header(copy, sequences=names, checksum=checksum))
+    with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
+        Numbers.create_parts(copy, [name], {}, 1)
+
+
 def test_a_finished_store_replaces_the_one_that_was_there(tmp_path, copy):
     store = store_at(copy, seed=2)
     assert Numbers.open(copy).attributes == {}

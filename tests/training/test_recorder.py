@@ -12,6 +12,7 @@ from preloaded import FORKSERVER
 from ruamel.yaml import YAML
 from torch import nn
 
+from polarnet.runtime.files import seal
 from polarnet.training.engine.recorder import HISTORY, Progress, Recorder, best_row, read_history, write_history
 
 EPOCHS = 30
@@ -82,6 +83,7 @@ ROWS = [
 
 def test_a_history_is_read_to_the_last_digit(tmp_path):
     write_history(tmp_path, ROWS)
+    seal(tmp_path)
     assert (tmp_path / HISTORY).read_text().splitlines()[0] == "epoch,train_total,train_ssim_loss,val_mse,val_psnr"
     assert str(read_history(tmp_path)) == str(ROWS)
     assert best_row(ROWS) is ROWS[0]  # the first of equally good epochs
@@ -89,6 +91,7 @@ def test_a_history_is_read_to_the_last_digit(tmp_path):
 
 def test_a_history_without_epochs_is_an_error(tmp_path):
     (tmp_path / HISTORY).write_text("epoch,train_total\n")
+    seal(tmp_path)
     with pytest.raises(ValueError, match="a line for each epoch"):
         read_history(tmp_path)
 

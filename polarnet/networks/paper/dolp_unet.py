@@ -22,11 +22,11 @@ MIDDLE_DOLP = 0.5  # initial bias of the output; DoLP lies in [0, 1]
 class DolpUNetConfig:
     """Section `networks.paper` of params.yaml."""
 
-    channels: list[PositiveInt]
+    channels: list[Annotated[int, Field(gt=0, le=1024)]]
     """Channels of C1; of S1 and G1; of S2, G2, R1 and R2. The paper has 32, 64, 128."""
     swin_depth: Annotated[int, Field(gt=0, le=100)]
     """Blocks per stage; every second block has shifted tiles."""
-    swin_window: Annotated[int, Field(ge=2)]
+    swin_window: Annotated[int, Field(ge=2, le=256)]
     """Side of an attention tile in pixels."""
     swin_heads: list[PositiveInt]
     """Attention heads of S1 and S2."""

@@ -1,11 +1,11 @@
 """polarnet's own network: it solves the redundancy of four polarizers at many scales and refines it with a U-Net."""
 
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -29,6 +29,8 @@ NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no su
 SOLVER_TENSORS = NOISE_TENSORS + SENSITIVITY_TENSORS + len(NO_STATE) + 1 + len(Panorama._fields)
 MAX_BINNING = 8
 Binning = Annotated[int, Field(ge=1, le=MAX_BINNING)]
+Item = TypeVar("Item")
+Few = Annotated[list[Item], Field(max_length=16)]
 
 
 @section
@@ -38,13 +40,13 @@ class StokesUNetConfig:
     binning: Binning
     """Side in pixels of the blocks whose events are averaged before anything else. Time falls with its square; the
     outputs are interpolated back to the sensor's size."""
-    channels: list[Annotated[int, Field(gt=0, le=4096)]]
+    channels: Few[Annotated[int, Field(gt=0, le=1024)]]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
-    memories: list[Annotated[float, Field(ge=0, le=0.999)]]
+    memories: Few[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each event sum that feeds the redundancy solver (0: present window only)."""
-    decays: list[Annotated[float, Field(ge=0, le=0.999)]]
+    decays: Few[Annotated[float, Field(ge=0, le=0.999)]]
     """Decay per window of each sum of second moments."""
-    scales: list[NonNegativeInt]
+    scales: Few[Annotated[int, Field(ge=0, le=4096)]]
     """Widths of the neighbourhoods solved together, in pixels at quarter resolution, odd; 0: the whole image."""
     reach: Annotated[int, Field(gt=0, le=1000)]
     """Search range in pixels along each axis for the scene's motion from window to window."""
@@ -58,7 +60,7 @@ class StokesUNetConfig:
     panorama_fade: Annotated[float, Field(ge=0, le=1)]
     panorama_step: PositiveFloat
     """Change of natural-log intensity per event of a sensor with scale 1 (`Scale`)."""
-    panorama_scale: PositiveInt
+    panorama_scale: Annotated[int, Field(gt=0, le=4096)]
     """Width of the neighbourhood whose mean comes from the network instead of the panorama, in pixels at quarter
     resolution, odd."""
     panorama_share: Annotated[float, Field(ge=0.01, le=0.99)]

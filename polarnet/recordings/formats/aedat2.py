@@ -1,8 +1,11 @@
 """AEDAT-2 files of jAER from a DAVIS (such as the PDAVIS): a header of # lines, then 8 bytes per event, big endian.
 
-The first four bytes are an address: y from the bottom in bits 22 to 30, x in bits 12 to 21, the polarity in bit 11.
-Entries with bit 31 (a frame's sample) or bit 10 (from the IMU or outside) set are not pixel events. The other four
-bytes are microseconds.
+The first four bytes are an address: y from the bottom in bits 22 to 30, the column in bits 12 to 21, the polarity in
+bit 11. Entries with bit 31 (a frame's sample) or bit 10 (from the IMU or outside) set are not pixel events. The other
+four bytes are microseconds.
+
+The column of an event counts from the right (width - 1 - x), that of a frame's sample from the left, as in jAER's
+DavisBaseCamera, tonic and v2e: with an even width, the other way round would exchange the columns of a mosaic.
 
 A frame has two samples of each pixel, of 10 bits: one after its reset (bits 10 and 11 are 0) and one after the exposure
 (bit 10 is 1, bit 11 is 0). Light is their difference.
@@ -46,7 +49,8 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
         entries = word_blocks(path, start, ENTRY, BLOCK_EVENTS, counts)
         for t, events in unwrapped(block[block["address"] & NO_EVENT == 0] for block in entries):
             address = events["address"].astype(np.int64)
-            yield Block(t, address >> 12 & 0x3FF, height - 1 - (address >> 22 & 0x1FF), address >> 11 & 1)
+            x, y = width - 1 - (address >> 12 & 0x3FF), height - 1 - (address >> 22 & 0x1FF)
+            yield Block(t, x, y, address >> 11 & 1)
 
     return Source(height, width, blocks)
 

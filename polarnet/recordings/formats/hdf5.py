@@ -118,7 +118,8 @@ def _described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Shape, number kind and fields of the tables of all layouts that the file has, and its `SETTINGS`."""
     tables = [table for _, columns in LAYOUTS.values() for table, _ in columns]
     names = [*tables, TRIGGERS, *E2P_FRAMES, *E2P_MAPS]
-    return ask_once(HDF5, path, isolated_worker.hdf5_description, names, SETTINGS)
+    shapes, values = ask_once(HDF5, path, isolated_worker.hdf5_description, names, SETTINGS)
+    return {name: (tuple(shape), kind, fields) for name, (shape, kind, fields) in shapes.items()}, values
 
 
 def _read(path: Path, columns: Sequence[Column]) -> Iterator[list[np.ndarray]]:

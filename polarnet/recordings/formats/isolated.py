@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from polarnet.recordings.formats.isolated_worker import serve
+from polarnet.recordings.formats.isolated_worker import received, serve
 from polarnet.recordings.source import RecordingError
 from polarnet.terminal.installation import installation
 
@@ -84,8 +84,7 @@ def _received(pipe: Connection) -> tuple[str, Any]:
     """`answer` and the next one, `error` and its message, or `end`; `crash` if the process gives no sound answer."""
     with contextlib.suppress(Exception):  # half an answer fails in any way
         if pipe.poll(PATIENCE_S):
-            kind, answer = pipe.recv()
-            return kind, answer
+            return received(pipe)
     return "crash", f"the library crashed or took over {PATIENCE_S} s"
 
 

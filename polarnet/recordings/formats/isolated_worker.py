@@ -1,9 +1,11 @@
 """The process of `isolated.ask`: runs tasks with format libraries and sends their answers.
 
 It imports nothing else of polarnet, so that it starts quickly. A task is a function of a path that yields answers.
+Answers are JSON and the bytes of arrays, since a damaged file may have made the library's process send anything.
 """
 
 import contextlib
+import json
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -29,12 +31,37 @@ def serve(pipe: Connection, max_mib: int) -> None:
             end = "end", ""
             try:
                 for answer in task(*arguments):
-                    pipe.send(("answer", answer))
+                    _send(pipe, "answer", answer)
             except BrokenPipeError:
                 raise
             except BaseException as error:  # HDF5 raises many kinds, and a panic in Rust code is not an Exception
                 end = "error", f"{type(error).__name__}: {error}"[:500]
-            pipe.send(end)
+            _send(pipe, *end)
+
+
+def _send(pipe: Connection, kind: str, answer: Any) -> None:
+    """Send a line of JSON, in which each array is its type and shape, and then the bytes of the arrays."""
+    arrays: list[np.ndarray] = []
+
+    def described(value: np.ndarray) -> dict[str, Any]:
+        arrays.append(np.ascontiguousarray(value))
+        return {"dtype": value.dtype.str, "shape": value.shape}
+
+    pipe.send_bytes(json.dumps([kind, answer], default=described).encode())
+    for array in arrays:
+        pipe.send_bytes(array.tobytes())
+
+
+def received(pipe: Connection) -> tuple[str, Any]:
+    """What `_send` sent; tuples have become lists."""
+
+    def whole(value: dict[str, Any]) -> Any:
+        if value.keys() != {"dtype", "shape"}:
+            return value
+        return np.frombuffer(pipe.recv_bytes(), value["dtype"]).reshape(value["shape"]).copy()
+
+    kind, answer = json.loads(pipe.recv_bytes(), object_hook=whole)
+    return kind, answer
 
 
 def gathered(pieces: Iterator[np.ndarray]) -> Iterator[np.ndarray]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.runtime.files import check_seal, claimed, replaced, seal, sha256
+from polarnet.runtime.files import check_seal, claimed, code_digest, publish, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.optimizers import Optimizer
 from polarnet.training.engine.parallel import place, wait_for_all
@@ -109,16 +109,18 @@ class Recorder:
     """Writes the outputs of a training into the folder `out`, and its running checkpoint below `resume`.
 
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
-    and its hash names the folder of the running checkpoint. `finish` deletes the running checkpoint. Old files in `out`
-    are removed first. If several processes share a training, only the first one writes.
+    and its hash, with that of the code, names the folder of the running checkpoint. Files lie in OUT.partial until
+    `finish`, which publishes them and deletes the running checkpoint. If several processes share a training, only the
+    first one writes.
 
     ValueError while another training writes into `out`. A training that is equal to a running one with another `out`,
     as two points of a sweep may be, waits until that has ended.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
-        self.out, self.metadata, self.keep_every_s = out, dict(metadata), keep_every_s
-        key = sha256(json.dumps(self.metadata, sort_keys=True).encode())
+        self.place, self.out = out, out.with_name(f"{out.name}.partial")
+        self.metadata, self.keep_every_s = dict(metadata), keep_every_s
+        key = sha256(json.dumps(self.metadata, sort_keys=True).encode(), code_digest().encode())
         self.running = resume / key[:16]
         self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
@@ -127,8 +129,8 @@ class Recorder:
             self._claims.enter_context(claimed(out))
             waiting = f"waiting until an equal training ends, whose running checkpoint is in {self.running}"
             self._claims.enter_context(claimed(self.running, lambda: ProgressBar.write(waiting)))
-            shutil.rmtree(out, ignore_errors=True)
-            out.mkdir(parents=True)
+            shutil.rmtree(self.out, ignore_errors=True)
+            self.out.mkdir(parents=True)
         wait_for_all()  # no process reads the running checkpoint of the training that the first one waits for
 
     def resume(self, network: nn.Module, optimizer: Optimizer) -> Progress:
@@ -179,8 +181,9 @@ class Recorder:
         seal(self.out)
 
     def finish(self) -> None:
-        """Delete the running checkpoint, because the training is complete."""
+        """Publish the files and delete the running checkpoint, because the training is complete."""
         if self.writes:
+            publish(self.out, self.place)
             shutil.rmtree(self.running, ignore_errors=True)
             self._claims.close()
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from polarnet.recordings.formats.aedat2 import aedat2_frames
 from polarnet.recordings.source import RecordingError
 
 HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
@@ -11,16 +12,34 @@ def write(path, words, header=HEADER):
     return path
 
 
-def address(x, y_from_below, p):
-    return y_from_below << 22 | x << 12 | p << 11
+def address(x_from_right, y_from_below, p):
+    return y_from_below << 22 | x_from_right << 12 | p << 11
 
 
 def test_events_of_a_davis_have_y_from_the_top_and_other_samples_are_left_out(tmp_path, read):
     sample, imu = 1 << 31 | address(5, 5, 1), 1 << 10 | address(6, 6, 0)
     path = write(tmp_path / "e.aedat", [(address(0, 259, 1), 10), (sample, 11), (imu, 12), (address(345, 0, 0), 13)])
-    assert read(path) == (("aedat2", 260, 346), [[10, 13], [0, 345], [0, 259], [1, -1]], {})
+    assert read(path) == (("aedat2", 260, 346), [[10, 13], [345, 0], [0, 259], [1, -1]], {})
     path.write_bytes(path.read_bytes()[:-3])
-    assert read(path)[1:] == ([[10], [0], [0], [1]], {"cut_tail": 1})
+    assert read(path)[1:] == ([[10], [345], [0], [1]], {"cut_tail": 1})
+
+
+def test_events_and_frames_of_one_moving_edge_lie_on_each_other(tmp_path, read):
+    """jAER stores the columns of events from the right, those of a frame's samples from the left."""
+    edge = 100  # the columns left of it are bright in the frame; its last bright column has just fired ON
+    y, x = np.mgrid[:260, :346]
+    place = (1 << 31 | (259 - y) << 22 | x << 12).ravel()
+    light = np.where(x < edge, 200, 20).ravel()
+    events = [(address(345 - (edge - 1), row, 1), 5000 + row) for row in range(260)]
+    signal = place | 1 << 10 | (900 - light)
+    frame = [(word, t_us) for words, t_us in ((place | 900, 1000), (signal, 9000)) for word in words]
+    path = write(tmp_path / "e.aedat", sorted([*frame, *events], key=lambda entry: entry[1]))
+    (level,) = aedat2_frames(path).levels
+    columns, rows = read(path)[1][1:3]
+    assert sorted(rows) == [*range(260)]
+    for row, column in zip(rows, columns, strict=True):
+        assert level[row, column] == 200
+        assert level[row, column + 1] == 20
 
 
 def test_an_event_that_begins_like_a_line_of_the_header_is_an_event(tmp_path, read):
