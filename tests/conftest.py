@@ -210,5 +210,9 @@ def write_trial() -> Callable[..., None]:
         for name, text in files.items():
             (job / name).parent.mkdir(parents=True, exist_ok=True)
             (job / name).write_text(text)
+        from polarnet.runtime.files import seal
+
+        if validation or test:
+            seal(job / "train" / "ours")
 
     return write

@@ -35,5 +35,10 @@ ROWS: Mapping[str, Reference | Method] = ChainMap(METHODS, REFERENCES)  # type: 
 
 
 def is_rotating(row: str) -> bool:
-    """Whether a row sees one camera behind a rotating polarizer instead of four channels."""
+    """Whether a row sees one camera behind a rotating polarizer instead of four channels.
+
+    >>> from polarnet.methods import is_rotating
+    >>> is_rotating("ours")
+    False
+    """
     return row in METHODS and METHODS[row].rotating

@@ -86,7 +86,7 @@ def test_every_kind_of_method_has_its_row_and_the_truth_is_that_of_the_files(
     assert "hardly agree" not in printed
     page = (tmp_path / "out" / "index.html").read_text()
     assert "polarnet benchmark --recordings" in page
-    stored = FrameStore.open(tmp_path / "out" / "work" / "frames.zarr")
+    stored = FrameStore.open(tmp_path / "out" / "work" / "set" / "frames.zarr")
     known = FrameStore.open(made / "set" / "frames.zarr")
     (name,), (original,) = stored.sequences, known.sequences
     assert (stored.dolp(name) - known.dolp(original)).abs().max() < 0.5 / 255 + 2e-5
