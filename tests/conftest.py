@@ -16,7 +16,7 @@ SLOWEST_FIRST = (
     "pipeline/test_stages.py",
     "pipeline/test_dvc.py",
     "benchmark/test_benchmark.py",
-    "cli/test_benchmark.py",
+    "cli/test_benchmark_command.py",
     "cli/test_simulate.py",
     "config/test_config.py",
     "reference/test_golden.py",

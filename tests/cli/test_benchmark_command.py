@@ -79,7 +79,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
         assert words in page
     assert 'src="http' not in page
     assert (out / "comparison.png").exists()
-    files = [path for path in (out / "work").rglob("*") if path.is_file()]
+    files = [path for path in (out / "work" / "set").rglob("*") if path.is_file()]
     written_ns = {path: path.stat().st_mtime_ns for path in files}
     given = metrics["ours"]
     assert run(project_root, monkeypatch, photographs, out) == 0  # by the shipped weights, on the same events
