@@ -216,7 +216,7 @@ def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, 
 def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
     with pytest.raises(ValueError, match="expected network polarnet, got paper; leave thresholds out"):
         dolp_recoverer(torch.nn.Identity(), COUNTS | {"network": "paper"}, thresholds=(0.1, 0.1))
-    with pytest.raises(ValueError, match="expected 0.001 to 10"):
+    with pytest.raises(ValueError, match=r"expected 0\.001 to 10"):
         dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.0))
 
 
