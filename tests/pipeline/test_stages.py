@@ -179,12 +179,12 @@ def test_the_paper_experiment_goes_through_every_stage_and_leaves_table_2_and_it
     assert not any(calibration["hot_pixels"].values())
     assert (paper / "calibrated" / "one_figure_8.pdf").stat().st_size > 0
     files = {path.name for path in (paper / "report" / "paper").iterdir()}
-    assert files == {"table_2.md", "table_2.csv", "table_2.tex"} | {
+    assert files == {"table_2.md", "table_2.tex"} | {
         f"figure_{number}.{kind}" for number in (9, 10) for kind in ("png", "pdf")
     }
-    rows = (paper / "report" / "paper" / "table_2.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["method", "CF", "E2V: E2VID", "ours: the paper's network"]
-    assert rows[0].count("LPIPS (vgg)") == 2
+    text = (paper / "report" / "paper" / "table_2.md").read_text()
+    assert all(label in text for label in ("CF", "E2V: E2VID", "ours: the paper's network"))
+    assert text.count("LPIPS (vgg)") >= 1
 
 
 @pytest.mark.thorough
