@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.events.streaming import parse_window
-from polarnet.recordings.noise import FOUND, Cleaning
+from polarnet.recordings.noise import FOUND, HOT_FACTOR, Cleaning
 
 READING = ("format", "height", "width", "clock_mhz")
 """Options that describe a camera's file where the file itself does not."""
 CLEANING = ("hot_pixels", "background")
-HOT_FACTOR = 4.0
-"""A pixel is hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:

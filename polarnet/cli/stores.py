@@ -8,11 +8,12 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.cli.options import HOT_FACTOR, reading_of
+from polarnet.cli.options import reading_of
 from polarnet.config.origins import origin_problems
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
+from polarnet.recordings.noise import HOT_FACTOR
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video

@@ -2,6 +2,7 @@
 
 import fnmatch
 import functools
+import math
 import re
 import subprocess
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.events import AliasEvent
+from ruamel.yaml.nodes import MappingNode, Node
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
@@ -24,7 +25,7 @@ GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 BEYOND_VALUES = re.compile(r"\$\{|^\s*#\s*@package", re.MULTILINE)
-MAX_ALIASES = 16  # nested, sixteen can double a list often enough to show, not to fill the memory
+MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 
 
 class WithNulls(RoundTripRepresenter):
@@ -141,11 +142,27 @@ def _check_params(settings: type, file: Path) -> None:
     text = file.read_text(encoding="utf-8")
     if found := BEYOND_VALUES.search(text):
         raise ValueError(f"{file}: expected plain values without Hydra's {found[0].strip()!r}; remove it")
-    if sum(isinstance(event, AliasEvent) for event in YAML(typ="safe", pure=True).parse(text)) > MAX_ALIASES:
-        raise ValueError(f"{file}: expected at most {MAX_ALIASES} aliases; write their values out")
-    for key in YAML(typ="safe", pure=True).load(text) or {}:
-        if refusal := unknown_key(settings, [str(key)]):
+    root = YAML(typ="safe", pure=True).compose(text)
+    if (values := _values_of(root)) > MAX_VALUES:
+        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {values:g}")
+    for key, _ in root.value if isinstance(root, MappingNode) else []:
+        if refusal := unknown_key(settings, [str(key.value)]):
             raise ValueError(f"{file}: {refusal}")
+
+
+def _values_of(root: Node | None) -> int | float:
+    """Number of values below a node, with every alias written out: a few lines can make billions."""
+    sizes: dict[int, int | float] = {}
+
+    def size(node: Node) -> int | float:
+        if id(node) not in sizes:
+            sizes[id(node)] = math.inf  # for an alias of a node inside itself
+            items = node.value if isinstance(node.value, list) else []
+            parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
+            sizes[id(node)] = 1 + sum(map(size, parts))
+        return sizes[id(node)]
+
+    return 0 if root is None else size(root)
 
 
 def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:

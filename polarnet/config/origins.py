@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ruamel.yaml import YAML
 
-from polarnet.runtime.files import ORIGIN, REMAKE, replaced, sha256
+from polarnet.runtime.files import ORIGIN, REMAKE, files_of, replaced, sha256
 
 if TYPE_CHECKING:
     from polarnet.config.tree import Config
@@ -259,12 +259,7 @@ def digest(paths: Iterable[Path]) -> str:
     """
     parts = []
     for path in paths:
-        for file in sorted(one for one in (path, *path.rglob("*")) if one.is_file() and _counts(one)):
+        for file in files_of(path):
             parts.append(f"{file.relative_to(path)}\0{(size := file.stat().st_size)}\0".encode())
             parts += [file.read_bytes()] if size <= MAX_HASHED else []
     return sha256(*parts)
-
-
-def _counts(file: Path) -> bool:
-    """Whether a file is a part of an artefact: not its origin, a hidden or a temporary file."""
-    return file.name != ORIGIN and file.suffix != ".tmp" and not file.name.startswith(".")

@@ -37,7 +37,7 @@ class SweepTable(Callback):
         write_csv(rows, folder / "comparison.csv")
         if axes := swept_axes(rows):
             (folder / "comparison.png").write_bytes(_plot(*axes))
-        print(f"\n{ranking(rows)}\nAll scores: {folder / 'comparison.csv'}")
+        print(f"\n{ranking(rows)}\n{best_point(rows)}\nAll scores: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
 
@@ -112,6 +112,29 @@ def _mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[s
     return means
 
 
+def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One sentence on the first of `sweep_rows`, with the 95 % interval of the mean over seeds (Student's t)."""
+    from scipy.stats import t  # slow to import
+
+    best = rows[0]
+    if not best["validation"]:
+        return "No point finished."
+    mse, count = best["validation"]["mse"], len(best["seeds"])
+    shared = shared_overrides(rows)
+    own = " ".join(one for one in best["overrides"] if one not in shared)
+    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
+    if mse["std"] is None:
+        return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
+    half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
+    return f"{words}, 95 % interval over {count} seeds {mse['mean'] - half:.4f} to {mse['mean'] + half:.4f}."
+
+
+def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Overrides that all of several `sweep_rows` have; none of a single row."""
+    first, *others = (row["overrides"] for row in rows)
+    return [one for one in first if others and all(one in overrides for overrides in others)]
+
+
 def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float]] | None:
     """Values of the keys that differ between finished rows, and their validation MSE; None if no key differs."""
     done = [row for row in rows if row["validation"]]
@@ -135,8 +158,7 @@ def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes
 
 def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
     """`sweep_rows` as lines: validation and test MSE, seeds, the overrides that not all rows share, and failures."""
-    every = [row["overrides"] for row in rows]
-    shared = [one for one in every[0] if len(every) > 1 and all(one in overrides for overrides in every)]
+    shared = shared_overrides(rows)
     lines = [f"{'validation MSE':>19}  {'test MSE':>19}  seeds   overrides"]
     for row in rows:
         finished, failed = len(row["seeds"]), len(row["failed_seeds"])

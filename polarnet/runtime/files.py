@@ -126,18 +126,20 @@ def check_room(folder: Path, needed: int, work: str) -> None:
 def seal(folder: Path) -> None:
     """Write the checksum of every file below a finished folder into its `SUMS`."""
     with replaced(folder / SUMS) as temporary:
-        lines = [f"{sha256(folder / name)}  {name}\n" for name in _sealable(folder)]
+        lines = [f"{sha256(folder / name)}  {name}\n" for name in _sealed(folder)]
         temporary.write_text("".join(lines), encoding="utf-8")
 
 
-def _sealable(folder: Path) -> list[str]:
-    """Names of the files below a folder that a seal lists: all but the seal, the origin, hidden and temporary ones."""
-    files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    return [
-        file.as_posix()
-        for file in files
-        if str(file) not in (SUMS, ORIGIN) and file.suffix != ".tmp" and not file.name.startswith(".")
-    ]
+def files_of(place: Path) -> list[Path]:
+    """Files of an artefact, a file or a folder, by name: all but its origin, hidden and temporary ones."""
+    files = sorted(path for path in (place, *place.rglob("*")) if path.is_file())
+    return [file for file in files if not (file.name == ORIGIN or file.suffix == ".tmp" or file.name.startswith("."))]
+
+
+def _sealed(folder: Path) -> list[str]:
+    """Names of the files that the seal of a folder lists, which are all but the seal itself."""
+    names = [file.relative_to(folder).as_posix() for file in files_of(folder)]
+    return [name for name in names if name != SUMS]
 
 
 def changed_files(folder: Path, names: Collection[str] | None = None) -> list[str]:
@@ -151,7 +153,7 @@ def changed_files(folder: Path, names: Collection[str] | None = None) -> list[st
     lines = [line.partition("  ") for line in seal_file.read_text(encoding="utf-8", errors="replace").splitlines()]
     listed = {name: digest for digest, _, name in lines}
     problems = []
-    for name in sorted({*listed, *_sealable(folder)} if names is None else names):
+    for name in sorted({*listed, *_sealed(folder)} if names is None else names):
         path = folder / name
         if name not in listed:
             problems.append(f"{path} is not in {seal_file}; {REMAKE}")

@@ -79,7 +79,9 @@ def test_a_row_refuses_a_network_that_was_trained_with_other_values(run):
 
 def test_files_of_a_user_have_no_origin_and_are_accepted(run, tmp_path):
     make_all(run, *SIMULATION)
-    run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}").check_inputs()
+    row = run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}")
+    row.check_inputs()
+    assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr", "data/weights"]
 
 
 def test_an_artefact_is_stale_if_it_is_missing_or_of_other_values(run):

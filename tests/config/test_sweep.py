@@ -11,6 +11,7 @@ from polarnet.config.sweep import (
     ranking,
     sweep_points,
     sweep_rows,
+    swept_axes,
     why_unfinished,
 )
 
@@ -73,6 +74,15 @@ def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sw
     assert lines[0]["seeds"] == "1 2"
     printed = capsys.readouterr().out
     assert "0.0400 ± 0.0141" in printed
+    # Student's t of 95 % and two seeds is 12.71: 0.04 -+ 12.71 * 0.01414 / sqrt(2)
+    assert "Best: loss.ssim=0.0, validation MSE 0.0400, 95 % interval over 2 seeds -0.0871 to 0.1671." in printed
+    assert (sweep / "comparison.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_axes_of_the_plot_are_the_keys_that_differ_and_only_finished_points_have_lines(sweep):
+    keys, scores = swept_axes(sweep_rows(sweep_points(sweep)))
+    assert keys == {"loss.ssim": ["0.0", "1.0"]}
+    assert scores == pytest.approx([0.04, 0.08])
 
 
 def test_a_job_is_finished_for_its_own_values_and_inputs_alone_and_says_what_changed(tmp_path):

@@ -93,6 +93,7 @@ def test_the_docs_say_which_stages_a_change_runs_again(project_root, traces, sta
     counts = {
         "missing_dependencies": sum(len(missing(traces[name], stage)[0]) for name, stage in stages.items()),
         "unread_keys_missing": sum(len(missing(traces[name], stage)[1]) for name, stage in stages.items()),
+        "unused_dependencies": sum(map(len, unused.values())),
         "dvc_yaml_lines": len((project_root / "dvc.yaml").read_text().splitlines()),
         "params_yaml_lines": len((project_root / "params.yaml").read_text().splitlines()),
     }
