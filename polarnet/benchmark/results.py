@@ -28,6 +28,7 @@ class RowRecord(NamedTuple):
     """Content of row.json."""
 
     row: str
+    """Its name, so that a copy under another is found out."""
     left_out: str | None
     """Reason why the row could not run; None if it ran."""
     weights: Mapping[str, Mapping[str, str]]
