@@ -34,7 +34,7 @@ def test_a_benchmark_stops_in_one_line_and_a_rerun_continues(tmp_path, project_r
     photographs.mkdir()
     for name in ("coffee", "astronaut", "rocket"):
         io.imsave(photographs / f"{name}.png", getattr(data, name)()[:200, :300], check_contrast=False)
-    work = tmp_path / "out" / "work"
+    work = tmp_path / "out" / "work" / "set"
     command = [sys.executable, "-m", "polarnet.cli", "benchmark", "--scenes", "photographs", "--out", "out",
                "--methods", "cf", "benchmark.lpips=false", "synthesize.duration_s=0.3", "synthesize.sensor_height=60",
                "synthesize.sensor_width=90", "runtime.workers=2"]  # fmt: skip

@@ -184,9 +184,8 @@ def test_the_paper_experiment_goes_through_every_stage_and_leaves_table_2_and_it
     }
     lines = (paper / "report" / "paper" / "table_2.md").read_text().splitlines()
     rows = [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
-    labels = [row[0] for row in rows]
-    assert [label for label in labels if label in ("CF", "E2V: E2VID", "ours: the paper's network")] == labels[-3:]
-    assert sum(cell.startswith("LPIPS (vgg)") for row in rows for cell in row) == 2
+    assert [row[0] for row in rows] == ["", "---", "CF", "E2V: E2VID", "ours: the paper's network"]
+    assert sum("LPIPS (vgg)" in cell for cell in rows[0]) == 2
 
 
 @pytest.mark.thorough
