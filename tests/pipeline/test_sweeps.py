@@ -86,7 +86,7 @@ def test_a_point_with_other_values_of_the_sensor_makes_its_own_events_in_its_own
     same, other = project / "outputs" / "b" / "0", project / "outputs" / "b" / "1"
     assert not (same / "events.zarr").exists()
     origin = json.loads((other / "events.zarr" / "origin.json").read_text())
-    assert origin["emulate"]["contrast_threshold_on"] == 0.3
+    assert origin["values"]["emulate"]["contrast_threshold_on"] == 0.3
     assert not (other / "scenes.zarr").exists()  # the pipeline's serve
     assert (project / "data" / "events.zarr" / "zarr.json").read_bytes() == before
     scores = [json.loads((job / "benchmark" / "metrics.json").read_text()) for job in (same, other)]
