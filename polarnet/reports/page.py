@@ -143,8 +143,7 @@ def _charts(sets: Sequence[Results], legend: Legend) -> dict[str, Any]:
     metrics, details = sets[0].metrics, sets[0].details
     means = details["scene_means"].get("mse", {})
     scored = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
-    rivals = [row for row in with_structure(means) if row != OURS] if OURS in means else []
-    rival = min(rivals, key=lambda row: metrics[row]["mse"], default=None)
+    rival = _best_other(OURS, metrics) if OURS in means else None
     groups = {row: entry["curve"] for row, entry in details.get("reliability", {}).items()}
     curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
     return {
@@ -165,14 +164,18 @@ def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
     mse, scenes = metrics[method]["mse"], len(details["scenes"])
     plural = "" if scenes == 1 else "s"
     start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
-    rivals = {row: metrics[row]["mse"] for row in with_structure(metrics) if row != method and not is_rotating(row)}
     parts = []
-    if rivals:
-        best = min(rivals, key=lambda row: rivals[row])
-        parts.append(f"{_against(mse, rivals[best])} the best other method ({legend.label(best)})")
+    if rival := _best_other(method, metrics):
+        parts.append(f"{_against(mse, metrics[rival]['mse'])} the best other method ({legend.label(rival)})")
     if (constant := metrics.get("oracle_mean", {}).get("mse")) and method != "oracle_mean":
         parts.append(f"{_against(mse, constant)} the best constant")
     return start + (f": {' and '.join(parts)}." if parts else ".")
+
+
+def _best_other(method: str, metrics: Scores) -> str | None:
+    """The ranked row with the smallest error beside a method's: neither a constant nor another camera's."""
+    others = [row for row in with_structure(metrics) if row != method and not is_rotating(row)]
+    return min(others, key=lambda row: metrics[row]["mse"], default=None)
 
 
 def _spoken(method: str, legend: Legend) -> str:

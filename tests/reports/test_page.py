@@ -42,6 +42,7 @@ def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the
     lower = r"\d+\xa0% lower than the best"
     assert re.search(rf"{lower} other method \(E2V: FireNet\) and {lower}", lead)
     assert lead.count(".") == 2  # the decimal point and the end
+    assert "MSE of E2V: FireNet" in page  # the axis of the scenes' chart
 
 
 def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(page):
