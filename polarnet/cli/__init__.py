@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"polarnet {options.command}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
+        warnings.simplefilter("ignore", RuntimeWarning)  # about a call of Zarr that was to start
         print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
     return status or 0
