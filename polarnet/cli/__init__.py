@@ -7,11 +7,19 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from polarnet.cli.commands import command_parser
-from polarnet.terminal.environment import INTERRUPTED, STOPPED, let_threads_sleep, silence_bindings
+from polarnet.terminal.environment import (
+    INTERRUPTED,
+    STOPPED,
+    announce_interrupts,
+    let_threads_sleep,
+    silence_bindings,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
+    if arguments is None:  # this process is the command
+        announce_interrupts()
     let_threads_sleep()
     silence_bindings()
     options = parse(arguments)

@@ -3,9 +3,11 @@
 import functools
 import multiprocessing
 import signal
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
@@ -84,14 +86,31 @@ def _collect(
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
     with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
-        futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
+        with _interrupts_ignored():  # by the workers too, until they are set up: their imports would show tracebacks
+            futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
         try:
             for future in as_completed(futures):
                 results[futures[future]] = future.result()
                 bar.update()
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt):
+                for worker in multiprocessing.active_children():
+                    worker.kill()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C in this process, and in those that it starts meanwhile."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread sets signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: Bar) -> list[Result]:

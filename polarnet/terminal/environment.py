@@ -2,10 +2,13 @@
 
 import atexit
 import os
+import signal
 import sys
-from types import TracebackType
+import time
+from types import FrameType, TracebackType
 
 INTERRUPTED = 130  # exit status of shells after Ctrl-C
+UNWINDING_S = 3.0  # after Ctrl-C, in which another one is ignored; later, it ends the program at once
 STOPPED = "stopped; finished work is kept, and the same command again continues from it"
 
 
@@ -20,7 +23,10 @@ def let_threads_sleep() -> None:
 
 
 def announce_interrupts() -> None:
-    """Let Ctrl-C end this program with the one line `STOPPED` instead of a traceback, even during its imports."""
+    """Let Ctrl-C end this program with the one line `STOPPED` instead of a traceback, even during its imports.
+
+    A program that was started with SIGINT ignored, as `nohup` and worker pools do, goes on ignoring it.
+    """
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         if issubclass(kind, KeyboardInterrupt):
@@ -28,7 +34,14 @@ def announce_interrupts() -> None:
         else:
             sys.__excepthook__(kind, error, trace)
 
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        first = time.monotonic()
+        signal.signal(signal.SIGINT, lambda *_: time.monotonic() > first + UNWINDING_S and os._exit(INTERRUPTED))
+        raise KeyboardInterrupt
+
     sys.excepthook = hook
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, interrupt)
 
 
 def silence_bindings() -> None:

@@ -9,6 +9,8 @@ import time
 import pytest
 from skimage import data, io
 
+from polarnet.terminal.environment import STOPPED, UNWINDING_S
+
 
 def heed_interrupts() -> None:
     """Undo what a shell sets for commands in its background."""
@@ -48,3 +50,38 @@ def test_a_benchmark_stops_in_one_line_and_a_rerun_continues(tmp_path, project_r
     again = [*command, "runtime.workers=1"]  # the same but for the start of two processes
     assert subprocess.run(again, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(project_root)}).returncode == 0
     assert (work / "images" / "manifest.json").stat().st_mtime_ns == before
+
+
+UNWINDING = """
+import sys, time
+from polarnet.terminal.environment import announce_interrupts
+announce_interrupts()
+try:
+    open(sys.argv[1], "w").close()
+    time.sleep(60)
+finally:
+    open(sys.argv[2], "w").close()
+    time.sleep(float(sys.argv[3]))
+    print("unwound")
+"""
+
+
+@pytest.mark.parametrize(("seconds", "unwound"), [(1.0, True), (60.0, False)])
+def test_a_second_interrupt_is_ignored_while_the_first_unwinds_and_ends_what_hangs(
+    tmp_path, project_root, seconds, unwound
+):
+    started, ending = tmp_path / "started", tmp_path / "ending"
+    command = [sys.executable, "-c", UNWINDING, str(started), str(ending), str(seconds)]
+    with subprocess.Popen(command, cwd=project_root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                          preexec_fn=heed_interrupts) as process:  # fmt: skip
+        for file in (started, ending):
+            while not file.exists():
+                assert process.poll() is None
+                time.sleep(0.02)
+            process.send_signal(signal.SIGINT)
+        if not unwound:
+            time.sleep(UNWINDING_S + 0.5)
+            process.send_signal(signal.SIGINT)
+        output, error = process.communicate(timeout=30)
+    assert output == ("unwound\n" if unwound else "")
+    assert error == (f"{STOPPED}\n" if unwound else "")
