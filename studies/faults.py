@@ -5,32 +5,31 @@
   as before. --runs names projects with a finished run (`polarnet preset smoke`, then `dvc repro`); the first is
   damaged, the others, such as one with seed=2, serve for exchanges.
 - kills: writers are killed at a random rename. The old or the new result must be whole, and a rerun must work.
-- same_bytes: the stages ingest, synthesize and emulate run at smoke size on several workers, and with libraries that
-  are restricted to older instructions of an x86-64 processor. Before each run, the libraries must say that they use no
-  newer instructions. The files must be equal.
+- names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
 
 --only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
 
+import contextlib
+import dataclasses
 import hashlib
+import io
 import itertools
 import json
 import multiprocessing
 import os
-import platform
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
-import cv2
 import numpy as np
 import torch
 
+from polarnet import cli
 from polarnet.benchmark.results import read_record, read_rows
 from polarnet.cli.outputs import run_folder
 from polarnet.config.origins import Run
@@ -41,98 +40,66 @@ from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.manifest import read_manifest
 from polarnet.runtime import files
-from polarnet.runtime.files import ORIGIN, SUMS, seal, sha256
+from polarnet.runtime.files import ORIGIN, SUMS, seal
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import read_history
-from studies.study import ROOT, arguments_of, command_line, machine_record, run_stage, write_section
+from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
 TEXTS = (".json", ".csv", "SHA256SUMS")
-OUTCOMES = ("refused", "harmless", "unnamed", "traceback", "silent", "lost")
-WORKERS = (2, 5)
-SMALL = ("experiment=smoke", "storage.sequences_per_part=2")  # ten parts, so that five workers have work
-OLD_PROCESSOR = {
-    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
-    "ATEN_CPU_CAPABILITY": "default",
-    "ONEDNN_MAX_CPU_ISA": "SSE41",
-    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FP16,AVX",
-    "NUMBA_CPU_NAME": "generic",
-    "NUMBA_CPU_FEATURES": "",
-    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX2,-FMA,-AVX",
-}
-"""Variables that keep numpy, torch, oneDNN, OpenCV, numba and the C library from AVX and FMA."""
-
+FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
+OUTCOMES = ("refused", "harmless", *FAILURES[:4])
 Generator = np.random.Generator
 Fault = Callable[[Path, Sequence[Path], Generator], None]
 """Damages the artefact in a folder; further folders hold others of its kind."""
 
 
 def digest(*values: Any) -> str:
-    """Hash of arrays, tensors, bytes and plain values, one after another; tuples and lists count by their parts."""
+    """Hash of arrays, tensors, bytes and plain values, one after another; collections and records count by parts."""
     content = hashlib.sha256()
     for value in values:
-        if isinstance(value, tuple | list):
-            content.update(digest(*value).encode())
+        parts = vars(value) if dataclasses.is_dataclass(value) else value
+        if isinstance(parts, Mapping):
+            parts = [*parts.items()]
+        if isinstance(parts, tuple | list):
+            content.update(digest(*parts).encode())
         else:
-            array = value.numpy() if isinstance(value, torch.Tensor) else value
+            array = parts.numpy() if isinstance(parts, torch.Tensor) else parts
             content.update(array.tobytes() if isinstance(array, np.ndarray) else repr(array).encode())
     return content.hexdigest()
 
 
-def read_store(folder: Path) -> str:
-    """All sequences of a store of events, frames or scenes."""
-    if folder.name == "events.zarr":
-        events = EventStore.open(folder)
-        return digest(*((name, [(e.t, e.x, e.y, e.p) for e in events.read(name)]) for name in events.sequences))
-    store: Any = FrameStore.open(folder) if folder.name == "frames.zarr" else SceneStore.open(folder)
-    read = store.frames if folder.name == "frames.zarr" else store.read
-    return digest(*((name, tuple(read(name))) for name in store.sequences))
+def values_of(kind: str, folder: Path) -> str:
+    """All values that the next stage uses of an artefact of this kind."""
+    if kind == "images":
+        manifest = read_manifest(folder)
+        return digest(manifest, *(read_rgb(folder / entry.file) for entry in manifest.pictures))
+    if kind == "training":
+        tensors, metadata = load_checkpoint(folder / "best.safetensors")
+        return digest(metadata, read_history(folder), *((name, tensors[name]) for name in sorted(tensors)))
+    if kind == "LPIPS":
+        backbone = stored_record(folder, "benchmark")["backbone"]
+        return digest(*Lpips.load(folder, "benchmark", backbone or "").state_dict().values())
+    if kind == "row":
+        sets = sorted(path.name for path in folder.iterdir() if path.is_dir())
+        return digest(read_record(folder), *(read_rows({folder.name: folder}, one) for one in sets))
+    store: Any = STORES[folder.stem].open(folder)
+    read = store.frames if folder.stem == "frames" else store.read
+    return digest(*((name, read(name)) for name in store.sequences))
 
 
-def read_images(folder: Path) -> str:
-    """The manifest and the pictures that it lists."""
-    manifest = read_manifest(folder)
-    return digest(manifest, *(read_rgb(folder / entry.file) for entry in manifest.pictures))
-
-
-def read_training(folder: Path) -> str:
-    """The best weights of a training with their record, and its history."""
-    tensors, metadata = load_checkpoint(folder / "best.safetensors")
-    return digest(metadata, read_history(folder), *((name, tensors[name]) for name in sorted(tensors)))
-
-
-def read_row(folder: Path) -> str:
-    """Scores and panels of a row of the tables on every set."""
-    values: list[Any] = [read_record(folder)]
-    for test_set in sorted(path.name for path in folder.iterdir() if path.is_dir()):
-        results = read_rows({folder.name: folder}, test_set)
-        values += [results.rows, results.costs]
-        for panel in results.panels:
-            shown = [panel.truth, *panel.predictions.values()]
-            values += [panel.events, panel.s0, panel.film_events, panel.film_s0, panel.film_t_us]
-            values += [frame for one in shown for frame in one if frame is not None]
-    return digest(*values)
-
-
-def read_weights(folder: Path) -> str:
-    """LPIPS of the table."""
-    backbone = stored_record(folder, "benchmark")["backbone"]
-    return digest(*Lpips.load(folder, "benchmark", backbone or "").state_dict().values())
-
-
-READERS: tuple[tuple[str, str, Callable[[Path], str]], ...] = (
-    ("store", "**/events.zarr", read_store),
-    ("store", "**/frames.zarr", read_store),
-    ("store", "**/scenes.zarr", read_store),
-    ("images", "images", read_images),
-    ("training", "train/*", read_training),
-    ("row", "benchmark/rows/*", read_row),
-    ("LPIPS", "weights", read_weights),
-)
-"""Kind of artefact, its folders below `paths.data`, and its reader: the hash of all values that the next stage uses."""
+STORES: dict[str, Any] = {"events": EventStore, "frames": FrameStore, "scenes": SceneStore}
+PLACES = {
+    "store": "**/*s.zarr",
+    "images": "images",
+    "training": "train/*",
+    "row": "benchmark/rows/*",
+    "LPIPS": "weights",
+}
+"""Folders of each kind of artefact, below `paths.data`."""
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -248,23 +215,22 @@ def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict
     with tempfile.TemporaryDirectory() as scratch:
         data = shutil.copytree(runs[0] / "data", Path(scratch, "data"))
         config = load(runs[0], [f"paths.data={data}"])
-        every = [(kind, read, folder) for kind, at, read in READERS for folder in sorted(data.glob(at))]
-        found = [one for one in every if files_in(one[2])]
+        every = [(kind, folder) for kind, at in PLACES.items() for folder in sorted(data.glob(at))]
+        found = [one for one in every if files_in(one[1])]
         if not found:
             raise SystemExit(f"--runs {runs[0]}: no artefacts of a run there; `dvc repro` makes some")
-        sound = {folder: read(folder) for _, read, folder in found}
+        sound = {folder: values_of(kind, folder) for kind, folder in found}
         for number in range(faults):
-            kind, read, folder = found[number % len(found)]
+            kind, folder = found[number % len(found)]
             name = [*FAULTS][int(generator.integers(len(FAULTS)))]
-            alike = [other for one, _, other in found if (one, other.suffix) == (kind, folder.suffix)]
-            others = [other for other in alike if other != folder]
+            others = [other for one, other in found if one == kind and other != folder]
             others += [run / "data" / folder.relative_to(data) for run in runs[1:]]
             kept = shutil.copytree(folder, Path(scratch, "kept"))
             FAULTS[name](folder, others, generator)
 
-            def use(read: Callable[[Path], str] = read, folder: Path = folder) -> str:
+            def use(kind: str = kind, folder: Path = folder) -> str:
                 Run(runs[0], config, "report").check_inputs()
-                return read(folder)
+                return values_of(kind, folder)
 
             what, message = outcome(use, folder, sound[folder])
             shutil.rmtree(folder)
@@ -288,9 +254,9 @@ def read_folder(place: Path) -> set[str]:
     return {file.read_text() for file in place.glob("*.txt")}
 
 
-def write_store(place: Path, value: str) -> None:
-    """A store of three parts with a value as its attribute and in its events."""
-    store = EventStore.create(place, ["a", "b", "c"], 8, 9, {"value": value})
+def write_store(place: Path, value: str, names: Sequence[str] = ("a", "b", "c")) -> None:
+    """A store with a value as its attribute and in its events, a part for each name."""
+    store = EventStore.create(place, names, 8, 9, {"value": value})
     for name in store.missing():
         t = torch.full((50,), int(value))
         x = torch.ones(50)
@@ -309,6 +275,20 @@ WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]
     "store": (write_store, read_events),
 }
 """What is killed while it replaces an old result with a new one, and what reads the values there."""
+NAMES = [
+    "../outside",
+    "../../../outside",
+    "{root}/outside",
+    "b/../../outside",
+    "..",
+    ".",
+    "",
+    "b\\..\\outside",
+    "b\x00",
+    "b\n",
+]
+COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
+"""Commands that read a store whole, and what follows its name."""
 
 
 def killed_write(write: Callable[[Path, str], None], place: Path, value: str, after: int) -> None:
@@ -348,69 +328,69 @@ def kills(cases: int) -> dict[str, dict[str, int]]:
     return counts
 
 
-def older_processor() -> dict[str, str]:
-    """Environment of a process whose libraries use neither AVX nor FMA; RuntimeError if one of them says it does."""
-    variables = {**os.environ, **OLD_PROCESSOR, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    script = "from studies.faults import newer_instructions; print(newer_instructions())"
-    done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
-    if done.stdout.strip() != "[]":
-        raise RuntimeError(f"expected no library with AVX or FMA under {OLD_PROCESSOR}, got {done.stdout.strip()}")
-    return variables
+def hostile_names(cases: int) -> dict[str, dict[str, int]]:
+    """Outcomes of commands on stores of a stranger, whose sequences have names that could be places.
 
-
-def newer_instructions() -> list[str]:
-    """Libraries that say in this process that they use AVX2, FMA or AVX-512."""
-    from numpy._core._multiarray_umath import __cpu_features__ as features
-
-    opencv = cv2.getCPUFeaturesLine().replace("*", "").split()  # the line marks disabled ones: AVX2?
-    uses = {
-        "numpy": any(features[one] for one in ("X86_V3", "X86_V4", "AVX512_ICL", "AVX512_SPR")),
-        "torch": torch.backends.cpu.get_cpu_capability() != "DEFAULT",
-        "OpenCV": "AVX2" in opencv,
-    }
-    return [library for library, newer in uses.items() if newer]
-
-
-def same_bytes() -> dict[str, dict[str, Any]]:
-    """For each run: the number of files, and of those whose bytes differ from the run on one worker."""
-    runs: dict[str, tuple[Mapping[str, str], int]] = {"1 worker": ({}, 1)}
-    runs |= {f"{workers} workers": ({}, workers) for workers in WORKERS}
-    if platform.machine() == "x86_64":
-        runs["1 worker, libraries without AVX and FMA"] = (older_processor(), 1)
-    rows: dict[str, dict[str, Any]] = {}
-    reference: dict[str, str] = {}
-    for name, (variables, workers) in runs.items():
-        with tempfile.TemporaryDirectory() as scratch:
-            overrides = (*SMALL, f"paths.data={scratch}", f"runtime.workers={workers}", f"hydra.run.dir={scratch}/log")
-            for stage in ("ingest", "synthesize", "emulate"):
-                run_stage(stage, *overrides, environment=variables)
-            files = [path for path in Path(scratch).rglob("*") if path.is_file() and "log" not in path.parts]
-            hashes = {path.relative_to(scratch).as_posix(): sha256(path) for path in files}
-        reference = reference or hashes
-        different = sum(hashes.get(file) != expected for file, expected in reference.items())
-        rows[name] = {"compared": len(reference), "different": different + len(hashes.keys() - reference.keys())}
-        print(name, rows[name], flush=True)
-    return rows
+    A file that a command writes beside its folder counts as outside.
+    """
+    counts = {f"{word} of a store with hostile names": dict.fromkeys(("refused", *FAILURES), 0) for word in COMMANDS}
+    for number in range(cases):
+        generator = generator_for(number, "faults", "names")
+        with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+            work = Path("a", "b", "work")
+            work.mkdir(parents=True)
+            name = NAMES[int(generator.integers(len(NAMES)))].format(root=scratch)
+            with mock.patch("polarnet.storage.parts.check_name", lambda name: name):
+                write_store(work / "events.zarr", "1", ["a", name])
+            before = {*Path(scratch).rglob("*")}
+            for word, options in COMMANDS.items():
+                with contextlib.chdir(work), contextlib.redirect_stderr(io.StringIO()) as errors:
+                    try:
+                        what = "refused" if cli.main([word, "events.zarr", *options]) else "silent"
+                    except Exception:
+                        what = "traceback"
+                if what == "refused" and "expected a name" not in errors.getvalue():
+                    what = "unnamed"
+                new = {*Path(scratch).rglob("*")} - before
+                outside = any(not path.is_relative_to(Path(scratch, work)) for path in new)
+                counts[f"{word} of a store with hostile names"]["outside" if outside else what] += 1
+    return counts
 
 
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--only", choices=("artefacts", "kills", "same_bytes"), help="default: all three")
+    parser.add_argument("--only", choices=("artefacts", "kills", "names"), help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
-    parser.add_argument("--kills", type=int, default=100, help="of each kind")
+    parser.add_argument("--kills", type=int, default=100, help="of each kind; and stores with hostile names")
     arguments = arguments_of(parser)
     studies: dict[str, Callable[[], Mapping[str, Any]]] = {
         "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
         "kills": lambda: kills(arguments.kills),
-        "same_bytes": same_bytes,
+        "names": lambda: hostile_names(arguments.kills),
     }
     for name in [arguments.only] if arguments.only else studies:
         record, figures = machine_record(), studies[name]()
         print(name, json.dumps(figures, indent=2))
         if arguments.write:
-            write_section("reliability", name, figures, record)
+            known = {**read_results(ROOT, "reliability"), name: figures}
+            write_section("reliability", name, figures, record, headlines(known))
+
+
+def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
+    """Counts over all kinds of faults, kills and names."""
+    kinds = [one for name in ("artefacts", "kills", "names") for one in sections.get(name, {}).values()]
+    total = {what: sum(one.get(what, 0) for one in kinds) for what in FAILURES}
+    return {
+        "faults_injected": sum(sum(one.values()) for one in kinds),
+        "faults_lost": total["lost"],
+        "silent_uses": total["silent"],
+        "stuck": total["stuck"],
+        "outside_writes": total["outside"],
+        "tracebacks": total["traceback"],
+        "kinds": len(kinds),
+    }
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ STUDIES = {
     "network": Study("speed_of_network", "robustness", "speed"),
     "rig": Study("rig", "recordings", "rig"),
     "recorded": Study("recorded", "recorded", "simulated", takes=("published",)),
-    "faults": Study("faults", "reliability", "same_bytes"),
+    "faults": Study("faults", "reliability", "artefacts"),
     "robustness": Study(
         "robustness", "robustness", "test", ("photographs", "measured", "work"), ("photographs_large", "published")
     ),

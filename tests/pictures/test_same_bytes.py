@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,9 +14,41 @@ from skimage import data
 
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.simulation.scene import polarization_from_rgb
-from studies.faults import OLD_PROCESSOR, older_processor
 
 REFERENCE = "9869284915ce1dd18a56fc4ec597740599d363e501ed495aeb257b6b2cc06773"
+OLD_PROCESSOR = {
+    "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR",
+    "ATEN_CPU_CAPABILITY": "default",
+    "ONEDNN_MAX_CPU_ISA": "SSE41",
+    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FP16,AVX",
+    "NUMBA_CPU_NAME": "generic",
+    "NUMBA_CPU_FEATURES": "",
+    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX2,-FMA,-AVX",
+}
+"""Variables that keep numpy, torch, oneDNN, OpenCV, numba and the C library from AVX and FMA."""
+
+
+def older_processor() -> dict[str, str]:
+    """Environment of a process whose libraries use neither AVX nor FMA; RuntimeError if one of them says it does."""
+    variables = {**os.environ, **OLD_PROCESSOR, "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path])}
+    script = "from test_same_bytes import newer_instructions; print(newer_instructions())"
+    done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
+    if done.stdout.strip() != "[]":
+        raise RuntimeError(f"expected no library with AVX or FMA under {OLD_PROCESSOR}, got {done.stdout.strip()}")
+    return variables
+
+
+def newer_instructions() -> list[str]:
+    """Libraries that say in this process that they use AVX2, FMA or AVX-512."""
+    from numpy._core._multiarray_umath import __cpu_features__ as features
+
+    opencv = cv2.getCPUFeaturesLine().replace("*", "").split()  # the line marks disabled ones: AVX2?
+    uses = {
+        "numpy": any(features[one] for one in ("X86_V3", "X86_V4", "AVX512_ICL", "AVX512_SPR")),
+        "torch": torch.backends.cpu.get_cpu_capability() != "DEFAULT",
+        "OpenCV": "AVX2" in opencv,
+    }
+    return [library for library, newer in uses.items() if newer]
 
 
 def hash_of_values() -> str:
@@ -39,7 +72,6 @@ def x86_64():
 def test_the_bytes_are_the_same_on_a_processor_without_avx_and_fma(tmp_path, x86_64):
     script = "import test_same_bytes; print(test_same_bytes.hash_of_values())"
     variables = older_processor() | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    variables["PYTHONPATH"] += os.pathsep + os.path.dirname(__file__)
     done = subprocess.run([sys.executable, "-c", script], env=variables, stdout=subprocess.PIPE, text=True, check=True)
     assert done.stdout.strip() == REFERENCE
 
