@@ -25,6 +25,7 @@ REMAKE = "run the stage that makes it again, or copy the folder again from where
 MAX_NAME = 200  # bytes; file systems allow 255, and names get suffixes
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 AT_FDCWD = -100
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # disk, quota, limit of a file's size
 
 
 def sha256(*parts: bytes | memoryview | Path) -> str:
@@ -113,6 +114,20 @@ def _to_disk(path: Path) -> None:
         os.close(handle)
 
 
+@contextmanager
+def named_shortage(path: Path) -> Iterator[None]:
+    """OSError that names `path` if the block ends because a disk is full, or a quota or a limit of a file is reached."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:  # RuntimeError: h5py
+        for shortage in map(os.strerror, FULL):
+            if shortage in str(error):
+                raise OSError(
+                    f"{path}: {shortage}; make room, or write to another disk, then run this again"
+                ) from error
+        raise
+
+
 def check_room(folder: Path, needed: int, work: str) -> None:
     """OSError if the disk of a folder, which need not exist yet, has less than `needed` bytes free."""
     free = shutil.disk_usage(next(path for path in (folder, *folder.absolute().parents) if path.exists())).free
@@ -192,7 +207,8 @@ def claimed(path: Path, say_waiting: Callable[[], None] | None = None) -> Iterat
         if not path.exists():
             with contextlib.suppress(FileNotFoundError):
                 path.with_name(f"{path.name}.old").rename(path)
-        yield
+        with named_shortage(path):
+            yield
     finally:
         file.unlink(missing_ok=True)
         lock.release()

@@ -1,3 +1,4 @@
+import errno
 import hashlib
 import os
 import shutil
@@ -6,7 +7,7 @@ import subprocess
 import pytest
 
 from polarnet.runtime import files
-from polarnet.runtime.files import SUMS, changed_files, check_name, check_seal, publish, replaced, seal, sha256
+from polarnet.runtime.files import SUMS, changed_files, check_name, check_seal, claimed, publish, replaced, seal, sha256
 
 
 def test_the_hash_of_parts_is_that_of_their_concatenation(tmp_path):
@@ -132,3 +133,15 @@ def test_bytes_are_on_the_disk_before_the_rename_and_the_name_after_it(tmp_path,
     place = calls.index("rename")
     assert {*calls[:place]} == {f"{tmp_path}/{name}" for name in ("out.tmp", "out.tmp/below", "out.tmp/below/b")}
     assert calls[place + 1 :] == [str(tmp_path)]
+
+
+@pytest.mark.parametrize("shortage", [errno.ENOSPC, errno.EFBIG])
+@pytest.mark.parametrize("kind", [OSError, RuntimeError])
+def test_a_shortage_names_the_place_and_what_to_do(tmp_path, shortage, kind):
+    words = f"file write failed, error message = '{os.strerror(shortage)}'"  # as h5py says it, without a number
+    error = OSError(shortage, os.strerror(shortage)) if kind is OSError else RuntimeError(words)
+    with (
+        pytest.raises(OSError, match=rf"{tmp_path}/new: {os.strerror(shortage)}; make room"),
+        claimed(tmp_path / "new"),
+    ):
+        raise error
