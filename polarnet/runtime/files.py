@@ -116,7 +116,7 @@ def _to_disk(path: Path) -> None:
 
 @contextmanager
 def named_shortage(path: Path) -> Iterator[None]:
-    """OSError that names `path` if the block ends because a disk is full, or a quota or a limit of a file is reached."""
+    """OSError that names `path` if the block ends because a disk is full, or a quota or a limit is reached."""
     try:
         yield
     except (OSError, RuntimeError) as error:  # RuntimeError: h5py
