@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
@@ -54,6 +55,8 @@ def _entries(folder: Path) -> list[Path]:
 def _check_owner(folder: Path, command: str) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder, got a file; name a folder")
+    if folder.exists() and not os.access(folder, os.W_OK):  # could be renamed, but not removed
+        raise ValueError(f"{folder}: expected a folder that you may write, it belongs to another user; name another")
     if not _entries(folder):
         return
     try:

@@ -85,7 +85,14 @@ def _collect(
     """Add the missing entries of `results`, until all are there or the pool breaks."""
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
-    with ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,)) as pool:
+    try:
+        executor = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,))
+    except OSError as error:
+        raise RuntimeError(
+            f"several processes need semaphores in /dev/shm, which cannot be made there: {error}; run again with "
+            "runtime.workers=1"
+        ) from error
+    with executor as pool:
         with _interrupts_ignored():  # by the workers too, until they are set up: their imports would show tracebacks
             futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
         try:

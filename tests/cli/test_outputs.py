@@ -90,3 +90,11 @@ def test_an_export_holds_the_sequences_of_one_store(tmp_path):
         assert main(["convert", str(tmp_path / f"{name}.zarr"), str(tmp_path / "out"), "--to", "text"]) == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"road", "store.json", MARKER}
     assert json.loads((tmp_path / "out" / MARKER).read_text()) == {"command": "polarnet convert"}
+
+
+def test_a_folder_of_another_user_is_refused_before_the_run(tmp_path, monkeypatch):
+    write(tmp_path / "out", "png/0.png")
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(ValueError, match="out: expected a folder that you may write"):
+        write(tmp_path / "out", "png/1.png")
+    assert names(tmp_path) == ["out/png/0.png", f"out/{MARKER}"]

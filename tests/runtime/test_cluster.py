@@ -1,3 +1,4 @@
+import errno
 import os
 import signal
 import sys
@@ -116,3 +117,12 @@ def test_a_dask_scheduler_that_ends_is_an_error(cluster, tmp_path):
     with pytest.raises(RuntimeError, match="the Dask scheduler has ended; start it"):
         pmap(note_and_sleep, [str(tmp_path)] * 3, workers=1, label="asleep", address=cluster.scheduler_address)
     ender.join()
+
+
+def test_without_semaphores_the_message_says_where_and_what_helps(monkeypatch):
+    def refuse(*arguments, **options):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("polarnet.runtime.cluster.ProcessPoolExecutor", refuse)
+    with pytest.raises(RuntimeError, match=r"/dev/shm.+Read-only file system.+runtime.workers=1"):
+        pmap(str, [1, 2], workers=2, label="numbers")
