@@ -1,0 +1,150 @@
+"""A static polarizer before a PDAVIS, written as jAER, DV and E2P write it: python -m studies.pdavis FOLDER [--write].
+
+Squares of a polarizer at 0, 30 or 90 degrees lie on a photograph, over which a sensor of 260x346 pixels with a mosaic
+moves. (Events of a scene that is polarized alike everywhere are those of an unpolarized one: they see ratios of light.)
+FOLDER gets pdavis_ANGLE.aedat, .aedat4 and .h5, each with events and frames. AoLP that `polarnet recover` finds in each
+file, and AoLP of its frames, are compared with the polarizer's. --write: docs/results/recordings.json, section pdavis.
+"""
+
+import math
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import dv_processing
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Int64, UInt8
+
+from polarnet.cli import main as polarnet
+from polarnet.events.mosaic import join_mosaic
+from polarnet.events.stream import Events
+from polarnet.networks.e2p.network import MOSAIC
+from polarnet.pictures.builtin import BUILTIN_PHOTOS
+from polarnet.pictures.images import read_rgb, write_png
+from polarnet.recordings.truth import read_truth
+from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, stokes_from_polarization
+from polarnet.storage.events import EventStore
+from polarnet.storage.true_frames import APPENDED, open_truth
+from studies.e2p_writer import WHITE, mosaicked, write_e2p
+from studies.study import arguments_of, command_line, machine_record, write_section
+
+MOSAIC_TEXT = "90 45 / 135 0"
+POLARIZERS_DEG, TRUE_DOLP = (0, 30, 90), 0.8
+SQUARE = 64  # pixels of the photograph, of which every other square lies behind the polarizer
+EXPOSURE_US, RESET_LEVEL = 8000, 900
+JAER_HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
+
+Frames = UInt8[np.ndarray, "n h w"]
+Times = Int64[np.ndarray, " n"]
+
+
+def write_aedat2(path: Path, events: Events, t_us: Times, frames: Frames) -> None:
+    """As jAER writes a DAVIS: columns of events count from the right, those of samples from the left, rows from below.
+
+    A frame has a sample of each pixel after its reset and one after its exposure, whose middle is at `t_us`.
+    """
+    up = (events.height - 1 - events.y.numpy().astype(np.int64)) << 22
+    words = up | (events.width - 1 - events.x.numpy().astype(np.int64)) << 12 | (events.p.numpy() > 0).astype(int) << 11
+    entries = [np.stack([words, events.t.numpy()], axis=1)]
+    y, x = np.mgrid[: events.height, : events.width]
+    place = (1 << 31 | (events.height - 1 - y) << 22 | x << 12).ravel()
+    for middle, frame in zip(t_us, frames, strict=True):
+        signal = place | 1 << 10 | (RESET_LEVEL - frame.ravel().astype(np.int64))
+        for sample, time in ((place | RESET_LEVEL, middle - EXPOSURE_US // 2), (signal, middle + EXPOSURE_US // 2)):
+            entries.append(np.stack([sample, np.full(len(sample), time)], axis=1))
+    table = np.concatenate(entries)
+    path.write_bytes(JAER_HEADER + table[np.argsort(table[:, 1], kind="stable")].astype(">u4").tobytes())
+
+
+def write_aedat4(path: Path, events: Events, t_us: Times, frames: Frames) -> None:
+    """As DV writes it, by its own library."""
+    size = events.width, events.height
+    config = dv_processing.io.MonoCameraWriter.Config("DAVIS346")
+    config.addEventStream(size)
+    config.addFrameStream(size)
+    writer = dv_processing.io.MonoCameraWriter(str(path), config)
+    store = dv_processing.EventStore()
+    for t, x, y, p in zip(*(column.tolist() for column in (events.t, events.x, events.y, events.p)), strict=True):
+        store.push_back(t, x, y, p > 0)
+    writer.writeEvents(store)
+    for middle, raw in zip(t_us.tolist(), frames, strict=True):
+        frame = dv_processing.Frame(middle - EXPOSURE_US // 2, raw)
+        frame.exposure = timedelta(microseconds=EXPOSURE_US)
+        writer.writeFrame(frame)
+
+
+def simulate(folder: Path, polarizer_deg: int) -> Path:
+    """Events and frames behind a polarizer, by `polarnet simulate` from its four measured intensities."""
+    grey = read_rgb(next(one.path for one in BUILTIN_PHOTOS if one.path.stem == "astronaut")).mean(0)
+    row, column = (torch.arange(side) // SQUARE % 2 for side in grey.shape)
+    polarized = (row[:, None] == column) * TRUE_DOLP
+    pictures = []
+    for angle in POLARIZER_ANGLES_DEG:
+        light = grey * (1 + polarized * math.cos(2 * math.radians(angle - polarizer_deg))) / (1 + TRUE_DOLP)
+        pictures.append(folder / f"polarizer{polarizer_deg}_{angle}.png")
+        write_png(pictures[-1], np.repeat(light.numpy()[..., None], 3, axis=2).astype(np.float32), 16)
+    made = folder / f"simulated_{polarizer_deg}"
+    size = ["synthesize.sensor_height=130", "synthesize.sensor_width=173", "synthesize.duration_s=0.5"]
+    if polarnet(["simulate", *map(str, pictures), "--out", str(made), "--no-preview", *size]):
+        raise SystemExit("polarnet simulate failed")
+    return made
+
+
+def write_recordings(made: Path, folder: Path, polarizer_deg: int) -> list[Path]:
+    """The simulated events and frames in the three formats; time starts at the half of an exposure."""
+    store = EventStore.open(made / "events.zarr")
+    events = join_mosaic(store.read(store.sequences[0]), MOSAIC)
+    truth = open_truth(made / APPENDED, store.sequences[0])
+    inside = np.flatnonzero(truth.t_us >= EXPOSURE_US)
+    frames = [truth[k] for k in inside]
+    intensity = intensities_from_stokes(torch.stack([stokes_from_polarization(f.s0, f.dolp, f.aolp) for f in frames]))
+    levels = np.rint(WHITE * mosaicked(2 * intensity.numpy()).clip(0, 1)).astype(np.uint8)
+    t_us, name = truth.t_us[inside], folder / f"pdavis_{polarizer_deg:03d}"
+    write_aedat2(name.with_suffix(".aedat"), events, t_us, levels)
+    write_aedat4(name.with_suffix(".aedat4"), events, t_us, levels)
+    write_e2p(name.with_suffix(".h5"), events, t_us, levels, None)
+    return [name.with_suffix(suffix) for suffix in (".aedat", ".aedat4", ".h5")]
+
+
+def error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> float:
+    """Difference in degrees between the polarizer and the mean of AoLP, weighted with DoLP, as an angle of [0, pi)."""
+    doubled = torch.polar(dolp.double(), 2 * (aolp.double() - math.radians(polarizer_deg))).mean()
+    return abs(math.degrees(float(doubled.angle())) / 2)
+
+
+def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
+    """Errors of the AoLP that `polarnet recover` and the recording's own frames give."""
+    out = recording.with_suffix("")
+    command = ["recover", str(recording), "--mosaic", MOSAIC_TEXT, "--out", str(out), "--write", "zarr"]
+    if polarnet(command):
+        raise SystemExit(f"polarnet {' '.join(command)} failed")
+    group = zarr.open_group(out / "recovered.zarr", mode="r")
+    aolp, dolp = (torch.from_numpy(np.asarray(group[name]).astype(np.float64)) for name in ("aolp", "dolp"))
+    truth = read_truth(recording, MOSAIC)
+    return {
+        "polarizer_deg": polarizer_deg,
+        "format": recording.suffix.removeprefix("."),
+        "aolp_error_deg": error_deg(aolp * (math.pi / 2**16), dolp, polarizer_deg),
+        "frames_aolp_error_deg": error_deg(truth.aolp[truth.valid], truth.dolp[truth.valid], polarizer_deg),
+    }
+
+
+def main() -> None:
+    """The command line."""
+    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser.add_argument("folder", type=Path, help="folder for the files")
+    arguments = arguments_of(parser)
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    record, rows = machine_record(), []
+    for polarizer_deg in POLARIZERS_DEG:
+        for recording in write_recordings(simulate(arguments.folder, polarizer_deg), arguments.folder, polarizer_deg):
+            rows.append(score(recording, polarizer_deg))
+            print(rows[-1], flush=True)
+    if arguments.write:
+        write_section("recordings", "pdavis", {"files": rows}, record)
+
+
+if __name__ == "__main__":
+    main()
