@@ -20,7 +20,6 @@ from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import check_overrides, preset_values
 from polarnet.config.origins import Run
 from polarnet.methods import METHODS
-from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import GainConfig, SharpeningConfig
 from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, is_stored, local_source
 from polarnet.networks.registry import NETWORKS, NetworkConfig
@@ -147,7 +146,6 @@ class Config:
     train: TrainConfig
     lpips: LpipsConfig
     methods: MethodsConfig
-    between: BetweenConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
     rows: dict[RowName, RowConfig]

@@ -238,8 +238,8 @@ class TruthScores:
         if not scores:
             raise ValueError(
                 f"--truth: expected more than {skipped} frames with a true frame at the end of their window, got "
-                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window and --rate, or "
-                f"record for longer"
+                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window, or record "
+                f"for longer"
             )
         means = {name: math.fsum(one[name] for one in scores) / len(scores) for name in scores[0]}
         words = ", ".join(SCORES[name].format(value) for name, value in means.items())
