@@ -104,8 +104,6 @@ class Cost:
     """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
     params: int
     """Parameters of the method's networks."""
-    peak_mib: float
-    """Peak memory of tensors and arrays over the first windows, without the sequence itself."""
 
 
 def scored_windows(sequence: TestSequence, warmup_windows: int) -> range:

@@ -10,7 +10,7 @@ from polarnet.config.tree import load
 
 
 def scored_rows(rows):
-    return Benchmark([], dict.fromkeys(rows, Cost(0.0, None, 0, 0.0)), [])
+    return Benchmark([], dict.fromkeys(rows, Cost(0.0, None, 0)), [])
 
 
 @pytest.mark.parametrize(("enabled", "scored"), [("false", ["simulated"]), ("true", ["simulated", "recordings"])])
