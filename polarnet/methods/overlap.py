@@ -21,7 +21,7 @@ import torch
 
 from polarnet.events.stream import Events, concatenate, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, State, each_map
+from polarnet.methods.method import Recoverer, State, each_map, joined
 from polarnet.stokes import Prediction
 
 STATES_PER_WINDOW = 64
@@ -92,9 +92,7 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
             history, prediction = advance(recoverer, state.history, parts)
             state = Recent(history, recent)
             frames.append(each_map(prediction, lambda field: field[-1]))
-        fields = zip(*frames, strict=True)
-        maps = [None if field[0] is None else torch.stack(field) for field in fields]
-        return state, Prediction(*maps)  # type: ignore[arg-type]
+        return state, joined(frames, torch.stack)
 
     return recoverer._replace(start=start, predict=predict)
 

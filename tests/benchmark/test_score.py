@@ -1,4 +1,3 @@
-import csv
 import dataclasses
 import math
 
@@ -12,7 +11,6 @@ from polarnet.benchmark.score import (
     scene_means,
     score_sequence,
     summary,
-    write_frames,
 )
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
@@ -49,19 +47,15 @@ def test_warm_up_windows_count_for_no_method(sequence):
     assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_frame_that_is_not_a_number_is_named_not_dropped(sequence, bad):
-    spoilt = sequence.dolp.clone()
-    spoilt[3, 5, 5] = bad
-    with pytest.raises(ValueError, match=r"m on a, window 3: mse is (nan|inf)"):
-        score_sequence(sequence, {"m": Prediction(spoilt)}, 0, None, CPU)
-
-
 def test_frames_that_cannot_be_scored_are_refused(sequence):
     with pytest.raises(ValueError, match=r"4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"):
         score_sequence(sequence, {"m": Prediction(sequence.dolp)}, 4, None, CPU)
-    with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
-        score_sequence(sequence, {"m": Prediction(sequence.dolp[:3])}, 0, None, CPU)
+    valid = torch.ones_like(sequence.dolp, dtype=torch.bool)
+    valid[2] = False
+    masked = dataclasses.replace(sequence, valid=valid)
+    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
+        score_sequence(masked, {"m": Prediction(sequence.dolp)}, 1, None, CPU)
+    assert len(score_sequence(masked, {"m": Prediction(sequence.dolp)}, 3, None, CPU)) == 1
 
 
 def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
@@ -90,17 +84,14 @@ def test_scenes_weigh_alike_however_many_sequences_show_them():
 
 def test_the_interval_is_the_same_every_time_and_shrinks_to_a_single_scene():
     rows = [row(f"s{i}", float(i)) for i in range(10)]
-    first, again, other = summary(rows, 500, 1), summary(rows, 500, 1), summary(rows, 500, 2)
+    first, again, other = summary(rows, 500, 1), summary(rows[::-1], 500, 1), summary(rows, 500, 2)
     assert first == again
     assert first["m"]["mse_ci"] != other["m"]["mse_ci"]
     low, high = first["m"]["mse_ci"]
     assert 2 < low < 4.5 < high < 7  # +- 1.96 * 2.87 / sqrt(10) = 1.78
     assert summary(rows[3:4], 500, 1)["m"]["mse_ci"] == [3.0, 3.0]
-
-
-def test_the_order_of_rows_changes_nothing():
-    rows = [row(f"s{i}", math.sqrt(i), window=k) for i in range(5) for k in range(3)]
-    assert summary(rows, 50, 0) == summary(rows[::-1], 50, 0)
+    assert first["m"]["lpips"] is None
+    assert "lpips_ci" not in first["m"]
 
 
 def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
@@ -124,29 +115,6 @@ def test_the_angle_is_scored_where_there_is_one(sequence):
     assert table["m"]["aolp_deg"] == pytest.approx(10, abs=1e-3)
     assert table["without"]["aolp_deg"] is None
     assert "without" not in scene_means(rows, "aolp_deg")
-
-
-def test_lpips_that_was_not_computed_is_null_without_an_interval():
-    table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
-    assert table["lpips"] is None
-    assert "lpips_ci" not in table
-    assert summary([row("x", 1.0, lpips=0.5)], 10, 0)["m"]["lpips"] == 0.5
-
-
-def test_a_method_that_lacks_a_scene_or_the_angle_of_some_frames_is_named():
-    with pytest.raises(ValueError, match=r"b has no score for \['y'\]"):
-        summary([row("x", 1.0, "a"), row("y", 1.0, "a"), row("x", 1.0, "b")], 10, 0)
-    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
-        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
-
-
-def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tmp_path):
-    write_frames(tmp_path / "frames.csv", [row("x", 0.1), row("y", 1 / 3, lpips=0.25)])
-    with (tmp_path / "frames.csv").open() as file:
-        first, second = csv.DictReader(file)
-    assert first["lpips"] == ""
-    assert float(second["mse"]) == 1 / 3
-    assert second["scene"] == "y"
 
 
 @pytest.mark.parametrize(
@@ -184,12 +152,3 @@ def test_masked_pixels_count_in_no_score(make_sequence):
         assert r.lpips == pytest.approx(lpips(mixed[None], sequence.dolp[r.window][None]).item(), rel=1e-4)
     unmasked = score_sequence(sequence, {"m": Prediction(other)}, 1, lpips, CPU)
     assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
-
-
-def test_a_frame_without_a_valid_pixel_is_not_left_out_silently(sequence):
-    valid = torch.ones_like(sequence.dolp, dtype=torch.bool)
-    valid[2] = False
-    masked = dataclasses.replace(sequence, valid=valid)
-    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
-        score_sequence(masked, {"m": Prediction(sequence.dolp)}, 1, None, CPU)
-    assert len(score_sequence(masked, {"m": Prediction(sequence.dolp)}, 3, None, CPU)) == 1
