@@ -24,7 +24,7 @@ from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.runtime.files import check_seal, claimed, code_digest, publish, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.optimizers import Optimizer
-from polarnet.training.engine.parallel import place, wait_for_all
+from polarnet.training.engine.parallel import place
 from polarnet.training.engine.sequences import Batch
 
 KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
@@ -111,10 +111,7 @@ class Recorder:
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
     and its hash, with that of the code, names the folder of the running checkpoint. Files lie in OUT.partial until
     `finish`, which publishes them and deletes the running checkpoint. If several processes share a training, only the
-    first one writes.
-
-    ValueError while another training writes into `out`. A training that is equal to a running one with another `out`,
-    as two points of a sweep may be, waits until that has ended.
+    first one writes. ValueError while another training writes into `out`, or while an equal one runs.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
@@ -127,11 +124,9 @@ class Recorder:
         self._claims = contextlib.ExitStack()
         if self.writes:
             self._claims.enter_context(claimed(out))
-            waiting = f"waiting until an equal training ends, whose running checkpoint is in {self.running}"
-            self._claims.enter_context(claimed(self.running, lambda: ProgressBar.write(waiting)))
+            self._claims.enter_context(claimed(self.running))
             shutil.rmtree(self.out, ignore_errors=True)
             self.out.mkdir(parents=True)
-        wait_for_all()  # no process reads the running checkpoint of the training that the first one waits for
 
     def resume(self, network: nn.Module, optimizer: Optimizer) -> Progress:
         """Restore network and optimizer from the running checkpoint, if there is one; ValueError if it is damaged."""
