@@ -67,11 +67,17 @@ def dolp_recoverer(
     for option, value in (("thresholds", thresholds), ("binning", binning)):
         if value is not None and not isinstance(ready, StokesUNet):
             raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
+    encode = REPRESENTATIONS[metadata["representation"]]
     if binning is not None:
         if not 1 <= binning <= MAX_BINNING:
             raise ValueError(f"binning: expected blocks with a side of 1 to {MAX_BINNING} px, got {binning}")
         ready.binning = binning
-    encode = REPRESENTATIONS[metadata["representation"]] if thresholds is None else _told(ready, thresholds)
+    if thresholds is not None:
+        if not all(0.001 <= threshold <= 10 for threshold in thresholds):
+            raise ValueError(f"thresholds: expected 0.001 to 10 in log intensity (ON, OFF), got {list(thresholds)}")
+        mean = math.sqrt(math.prod(thresholds))
+        ready.scale.given = mean / ready.step
+        encode = weighted_counts([threshold / mean for threshold in thresholds])
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         inputs = torch.stack([_encoded(window, encode) for window in windows])
@@ -80,21 +86,12 @@ def dolp_recoverer(
         return state, each_map(prediction, lambda field: field[:, 0])
 
     def at_once(height: int, width: int) -> int:
-        side = ready.binning if isinstance(ready, StokesUNet) else 1
+        side = getattr(ready, "binning", 1)
         return windows_at_once(height // side, width // side)
 
     recoverer = Recoverer(no_state, predict, network=ready, at_once=at_once)
     trained_us = trained_window_us(metadata)
     return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
-
-
-def _told(network: StokesUNet, thresholds: Sequence[float]) -> Encode:
-    """Give a network the mean of the camera's thresholds; each event counts as its threshold over this mean."""
-    if not all(0.001 <= threshold <= 10 for threshold in thresholds):
-        raise ValueError(f"thresholds: expected 0.001 to 10 in natural-log intensity (ON, OFF), got {list(thresholds)}")
-    mean = math.sqrt(math.prod(thresholds))
-    network.scale.given = mean / network.step
-    return weighted_counts([threshold / mean for threshold in thresholds])
 
 
 def weighted_counts(steps: Sequence[float]) -> Encode:

@@ -178,10 +178,10 @@ def why_absent(method: Method, setup: Setup) -> str | None:
         return f"no weights are given: add the row to section `rows` of params.yaml, with their file as {key}"
     if not path.exists():
         return f"{path} is not there"
-    networks = method.weights.networks
-    if path.suffix == ".safetensors" and (network := load_checkpoint(path)[1]["network"]) not in networks:
-        return f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
-    return None
+    networks, network = method.weights.networks, weights_record(method, setup)["network"]
+    if network in networks:
+        return None
+    return f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
 
 
 def weights_record(method: Method, setup: Setup) -> dict[str, str]:

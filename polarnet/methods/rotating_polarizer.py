@@ -126,9 +126,9 @@ def _fit(
 ) -> Float64[np.ndarray, "3 count"]:
     """b / a, c / a and the number of events of each pixel, from events in time order."""
     level = np.zeros(count)  # sum of a pixel's steps since its first event
-    sums = np.zeros((count, 8))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin); y w = 1 / y
+    sums = np.zeros((count, 8))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin)
     fitted = np.zeros((3, count))
-    ones = np.zeros(count)
+    ones = np.zeros(count)  # sum of y w, which is 1 / y
     for k in range(len(pixel)):
         i, c, s = pixel[k], cos[k], sin[k]
         if fitted[2, i] > 0:

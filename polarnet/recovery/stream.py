@@ -17,7 +17,7 @@ from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, Event
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
-from polarnet.metrics.scores import frame_scores
+from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.live import Piece
 from polarnet.recovery.writer import RecoveryWriter

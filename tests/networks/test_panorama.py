@@ -64,16 +64,12 @@ def test_windows_that_show_different_things_or_nothing_have_no_motion():
     torch.testing.assert_close(displacements(small, 40).displacement, torch.zeros(1, 1, 2), atol=0.5, rtol=0)
 
 
-def test_one_pixel_that_always_fires_does_not_hide_the_motion():
-    changes = views([(4.0 * k, 1.0 * k) for k in range(3)]).diff(dim=0).sum(1, keepdim=True).round()
-    changes[:, :, 20, 30] = 500.0
-    motion = displacements(changes, reach=8)
-    torch.testing.assert_close(motion.displacement, torch.tensor([[[4.0, 1.0]]]), atol=0.3, rtol=0)
-
-
-def test_streams_are_searched_one_by_one():
-    images = torch.cat([views([(s * k, 0.0) for k in range(4)]).diff(dim=0).sum(1, keepdim=True) for s in (2, 5)], 1)
+def test_one_pixel_that_always_fires_does_not_hide_the_motion_and_streams_are_searched_one_by_one():
+    changes = [views([(k * x, k * y) for k in range(3)]).diff(dim=0).sum(1, keepdim=True) for x, y in ((4, 1), (2, 0))]
+    images = torch.cat(changes, dim=1).round()
+    images[:, 0, 20, 30] = 500.0
     together = displacements(images, reach=8)
+    torch.testing.assert_close(together.displacement[0], torch.tensor([[4.0, 1.0], [2.0, 0.0]]), atol=0.3, rtol=0)
     for stream in range(2):
         alone = displacements(images[:, stream : stream + 1], reach=8)
         torch.testing.assert_close(together.displacement[:, stream], alone.displacement[:, 0])
