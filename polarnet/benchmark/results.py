@@ -15,9 +15,16 @@ from typing import Any, NamedTuple
 
 import torch
 
-from polarnet.benchmark.paired import paired_comparisons
 from polarnet.benchmark.run import Benchmark
-from polarnet.benchmark.score import METRICS, BenchmarkConfig, Cost, FrameScore, scene_means, summary
+from polarnet.benchmark.score import (
+    METRICS,
+    BenchmarkConfig,
+    Cost,
+    FrameScore,
+    paired_comparisons,
+    scene_means,
+    summary,
+)
 from polarnet.metrics.reliability import Reliability
 from polarnet.runtime.files import check_seal, publish, seal
 from polarnet.storage.panels import read_panel, write_panel

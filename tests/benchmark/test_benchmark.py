@@ -26,18 +26,17 @@ def config(**changes):
     return dataclasses.replace(settings, **changes)
 
 
-def test_a_test_sequence_has_the_truth_at_the_end_of_each_window(five_scenes, make_sequence):
+def test_a_test_sequence_has_the_truth_at_window_ends_and_the_training_mean_starts_after_the_warm_up(
+    five_scenes, make_sequence
+):
     sequences = [five_scenes.sequence(name) for name in five_scenes.sequences]
     assert [(r.name, r.scene) for r in sequences] == [("a1", "lake"), ("a2", "lake"), ("b1", "wood"), ("c1", "town")]
     expected = make_sequence("a1", seed=1)
     torch.testing.assert_close(sequences[0].dolp, expected.dolp, atol=1e-5, rtol=0)
     torch.testing.assert_close(sequences[0].s0, expected.s0, atol=2e-5, rtol=0)
     assert torch.equal(sequences[0].events[3].t, expected.events[3].t)
-
-
-def test_the_training_mean_counts_training_frames_after_the_warm_up(five_scenes, make_sequence):
-    expected = make_sequence("t1", seed=0).dolp[1:].mean().item()
-    assert train_mean_dolp(five_scenes.frames, 1) == pytest.approx(expected, abs=1e-5)
+    training_mean = make_sequence("t1", seed=0).dolp[1:].mean().item()
+    assert train_mean_dolp(five_scenes.frames, 1) == pytest.approx(training_mean, abs=1e-5)
 
 
 def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):

@@ -1,13 +1,17 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import wilcoxon
 
 from polarnet.benchmark.score import (
     METRICS,
     BenchmarkConfig,
     FrameScore,
+    compared,
+    paired_comparisons,
     scene_means,
     score_sequence,
     summary,
@@ -24,12 +28,13 @@ def row(scene, value, method="m", sequence=None, window=0, lpips=None, aolp_deg=
     return FrameScore(method, scene, sequence or scene, window, 0, **scores)
 
 
-def config(**changes):
-    settings = BenchmarkConfig(["zeros"], ["simulated"], 1, "fp32", False, "alex", 10, 1)
-    return dataclasses.replace(settings, **changes)
+SETTINGS = {
+    "methods": ["zeros"], "sets": ["simulated"], "warmup_windows": 1, "precision": "fp32", "lpips": False,
+    "lpips_backbone": "alex", "bootstrap_samples": 10, "panel_scenes": 1,
+}  # fmt: skip
 
 
-def test_a_constant_offset_scores_its_square_as_level(sequence):
+def test_a_constant_offset_scores_its_square_as_level_in_windows_after_the_warm_up(sequence):
     sequence = dataclasses.replace(sequence, dolp=0.5 * sequence.dolp)
     rows = score_sequence(sequence, {"m": Prediction(sequence.dolp + 0.1)}, 0, None, CPU)
     assert [r.window for r in rows] == [0, 1, 2, 3]
@@ -38,11 +43,8 @@ def test_a_constant_offset_scores_its_square_as_level(sequence):
         scores = (r.mse, r.psnr, r.level_mse, r.pattern_mse, r.corr)
         assert scores == pytest.approx((0.01, 20, 0.01, 0, 1), abs=1e-6)
         assert r.lpips is None
-
-
-def test_warm_up_windows_count_for_no_method(sequence):
     spoilt = sequence.dolp.clone()
-    spoilt[:2] = float("nan")
+    spoilt[:2] = float("nan")  # windows of the warm-up count for no method
     rows = score_sequence(sequence, {"a": Prediction(spoilt), "b": Prediction(sequence.dolp)}, 2, None, CPU)
     assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
 
@@ -117,21 +119,16 @@ def test_the_angle_is_scored_where_there_is_one(sequence):
     assert "without" not in scene_means(rows, "aolp_deg")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
-        ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
-        ({"methods": []}, "methods: expected at least one and none twice"),
-        ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-        ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
-        ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
-        ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
+    ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
+    ({"methods": []}, "methods: expected at least one and none twice"),
+    ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
+    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
+])  # fmt: skip
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        config(**change)
+        BenchmarkConfig(**{**SETTINGS, **change})
 
 
 def test_masked_pixels_count_in_no_score(make_sequence):
@@ -152,3 +149,36 @@ def test_masked_pixels_count_in_no_score(make_sequence):
         assert r.lpips == pytest.approx(lpips(mixed[None], sequence.dolp[r.window][None]).item(), rel=1e-4)
     unmasked = score_sequence(sequence, {"m": Prediction(other)}, 1, lpips, CPU)
     assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
+
+
+def test_winning_all_of_six_scenes_has_effect_1_and_the_smallest_p_there_is():
+    comparison = compared(np.arange(1.0, 7.0))
+    assert comparison == {"scenes": 6, "better": 6, "effect": 1.0, "p": pytest.approx(2 / 2**6)}
+
+
+def test_ranks_by_hand():
+    # |gains| rank 1, 2, 3, 4; the second smallest is a loss: (1 - 2 + 3 + 4) / 10
+    comparison = compared(np.array([0.1, -0.2, 0.3, 0.4]))
+    assert comparison["effect"] == pytest.approx(0.6)
+    assert comparison["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
+
+
+def test_lower_is_better_for_errors_and_higher_for_psnr():
+    rows = [row(f"s{i}", 1.0 + i, "ours") for i in range(4)] + [row(f"s{i}", 2.0 + 1.5 * i, "cf") for i in range(4)]
+    comparison = paired_comparisons(rows, "ours")["cf"]
+    assert comparison["mse"]["better"] == 4
+    assert comparison["psnr"]["better"] == 0
+    assert comparison["mse"]["median_difference"] == pytest.approx(-1.75)
+    assert comparison["psnr"]["effect"] == -1
+    assert "lpips" not in comparison
+    assert paired_comparisons(rows, "zeros") == {}
+
+
+def test_holm_corrects_for_the_number_of_rivals_and_never_falls():
+    gains = {"a": [1, 2, 3, 4, 5, 6], "b": [1, 2, 3, 4, 5, -6], "c": [-1, 2, -3, 4, -5, 6]}
+    rows = [row(f"s{i}", 10.0, "ours") for i in range(6)]
+    rows += [row(f"s{i}", 10.0 + gain, name) for name, values in gains.items() for i, gain in enumerate(values)]
+    by_rival = {rival: scores["mse"] for rival, scores in paired_comparisons(rows, "ours").items()}
+    assert by_rival["a"]["p_holm"] == pytest.approx(3 * by_rival["a"]["p"])
+    assert by_rival["b"]["p_holm"] == pytest.approx(2 * by_rival["b"]["p"])
+    assert by_rival["a"]["p_holm"] <= by_rival["b"]["p_holm"] <= by_rival["c"]["p_holm"] <= 1

@@ -167,7 +167,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
         thorough("reports/charts.py", {"calibrate", "report"}),
-        thorough("benchmark/paired.py", {"report"} | ROWS),
+        thorough("benchmark/results.py", {"report"} | ROWS),
         thorough("cli/doctor.py", set()),
     ],
 )
