@@ -92,7 +92,7 @@ def why_left_out(name: str, context: Context) -> str | None:
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
     """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights."""
-    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]
+    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].networks]
     return {method.section: weights_record(method, context.setups[method.section]) for method in methods}
 
 

@@ -23,8 +23,8 @@ from polarnet.methods.method import (
     Recoverer,
     Setup,
     State,
-    Weights,
     each_map,
+    network_recoverer,
     no_state,
     weights_file,
     windows_at_once,
@@ -121,21 +121,15 @@ def open_e2p(setup: Setup, *, published: bool) -> Recoverer:
     """Open E2P; its authors' weights (`published`) saw one voxel grid of the whole mosaic, polarnet's one a channel."""
     network = load_baseline({"e2p": E2p}, weights_file(setup)).to(setup.device)
 
-    def grid(window: EventWindow) -> Float[Tensor, "bins h w"]:
+    def encode(window: EventWindow) -> Float[Tensor, "1 bins h w"]:
         if published:
-            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins)
-        return interleaved(voxel_grids(window, network.bins))
+            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins).to(setup.device)[None]
+        return interleaved(voxel_grids(window, network.bins)).to(setup.device)[None]
 
-    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        frames = []
-        for window in windows:
-            with setup.autocast():
-                maps, state = network(grid(window).to(setup.device)[None], state)
-            frames.append(maps[0].float())
-        maps = torch.stack(frames)
-        return state, Prediction(maps[:, -1], angle_of(maps))
+    def prediction_of(maps: Float[Tensor, "n 1 maps h w"]) -> Prediction:
+        return Prediction(maps[:, 0, -1], angle_of(maps[:, 0]))
 
-    return Recoverer(no_state, predict, network=network)
+    return network_recoverer(network, setup, encode, prediction_of)
 
 
 METHODS = (
@@ -144,7 +138,7 @@ METHODS = (
         label="E2P",
         colour="#7a5cc4",
         open=functools.partial(open_e2p, published=False),
-        weights=Weights(("e2p",)),
+        networks=("e2p",),
         about="E2P (Mei et al. 2023), a published network from events to polarization.",
     ),
     Method(
@@ -152,14 +146,14 @@ METHODS = (
         label="E2P, published weights",
         colour="#7a5cc4",
         open=functools.partial(open_e2p, published=True),
-        weights=Weights(("e2p",)),
+        networks=("e2p",),
     ),
     Method(
         name="paper",
         label="the paper's network",
         colour="#0ca678",
         open=open_dolp_network,
-        weights=Weights(tuple(NETWORKS)),
+        networks=tuple(NETWORKS),
         about="The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
         "DoLP out.",
     ),
@@ -169,7 +163,8 @@ METHODS = (
         colour="#d6336c",
         open=open_dolp_network,
         config=DolpNetworkConfig,
-        weights=Weights(tuple(NETWORKS), shipped=True),
+        networks=tuple(NETWORKS),
+        shipped=True,
         about="The DoLP network in use.",
     ),
 )

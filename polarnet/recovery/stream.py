@@ -97,12 +97,12 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
             raise ValueError(f"--{option} is for the DoLP network, {method.name} does not use it")
         if value is not None:
             setup = replace(setup, config=replace(setup.config, **{option: value}))
-    if method.weights is None:
+    if not method.networks:
         if chosen.weights is not None:
             raise ValueError(f"--weights: {method.name} has no weights; leave it out")
         turns = f", {setup.rotation.rate_hz:g} turns/s" if setup.rotation else ""
         return method.open(setup), f"{method.name}{turns}"
-    weights = chosen.weights or (shipped_weights() if method.weights.shipped else setup.weights)
+    weights = chosen.weights or (shipped_weights() if method.shipped else setup.weights)
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")

@@ -73,7 +73,7 @@ def test_windows_at_once_give_what_they_give_one_by_one_and_a_step_changes_no_st
 
 
 def test_filters_come_first_then_reconstructions_then_networks_of_dolp():
-    kinds = [(method.weights is not None, not method.reconstructs) for method in METHODS.values()]
+    kinds = [(bool(method.networks), not method.reconstructs) for method in METHODS.values()]
     assert kinds == sorted(kinds)
     assert list(METHODS)[:4] == ["cf", "highpass", "cf+gain", "highpass+gain"]
     assert list(METHODS)[-4:] == ["e2p", "e2p_published", "paper", "ours"]
