@@ -309,8 +309,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
         or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        if script != "weights":  # that stage searches for weights and may download them
-            or_exit(lambda: _check_lpips(config))
+        or_exit(lambda: _check_lpips(config))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
