@@ -143,7 +143,7 @@ def test_a_damaged_running_checkpoint_is_refused_wherever_the_damage_is(stores, 
         run(small_task(), stores, tmp_path)
 
 
-def test_so_does_one_that_muon_trains(stores, tmp_path):
+def test_a_training_by_muon_that_is_killed_and_resumed_ends_so_too(stores, tmp_path):
     def task() -> Task:
         return dataclasses.replace(small_task(), optimizer="muon")
 
