@@ -108,17 +108,12 @@ def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     assert inputs.dtype == torch.int8
     assert torch.equal(inputs.float(), counts.inputs)
 
+    less = stack([apply_view(packed(sequence(), intensity=False), WHOLE)] * 2)
+    assert less.intensity.numel() == 0
+    assert torch.equal(less.dolp[:, 1], sequence().dolp)
     for value in (0.5, 128.0, -129.0, 1e9):  # which bytes do not hold
         before = sequence()._replace(inputs=torch.full((3, 8, 6, 8), value))
         assert packed(before, intensity=True) is before
-
-
-def test_a_sequence_without_its_intensity_is_seen_as_before_otherwise():
-    whole, compact = sequence(), packed(sequence(), intensity=False)
-    batch = stack([apply_view(compact, WHOLE)] * 2)
-    assert batch.intensity.numel() == 0
-    assert torch.equal(batch.dolp[:, 1], whole.dolp)
-    assert torch.equal(batch.inputs[:, 1], whole.inputs)
 
 
 def test_a_crop_larger_than_the_image_and_a_batch_of_unequal_lengths_are_refused():
