@@ -209,7 +209,7 @@ def each_map(prediction: Prediction, change: Callable[[Tensor], Tensor]) -> Pred
     return Prediction(*(None if field is None else change(field) for field in prediction))  # type: ignore[arg-type]
 
 
-def joined(predictions: Sequence[Prediction], join: Callable[[Sequence[Tensor]], Tensor] = torch.cat) -> Prediction:
+def joined(predictions: Sequence[Prediction], join: Callable[..., Tensor] = torch.cat) -> Prediction:
     """Join the maps of several predictions, along their first axis or by `join`."""
     fields = zip(*predictions, strict=True)
     return Prediction(*(None if maps[0] is None else join(maps) for maps in fields))  # type: ignore[arg-type]
