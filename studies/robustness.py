@@ -12,11 +12,8 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS. `ours, thresholds given` is told the contrast
   thresholds of the sensor (`methods.ours.thresholds`).
 - `time.5ms`: the scenes of the sensors with windows of 5 ms.
-- `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), at 16
-  times between the ends of two windows: `ours`, carried on by motion and events; `ours, held`, the last frame of a
-  window unchanged; `ours, window ends`, the frames of the windows themselves.
 
-Under each condition but the last two, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
+Under each condition, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
 
 Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
 the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
@@ -29,10 +26,9 @@ network trained on them (`ingest.root`) has seen no photograph of --split val an
 
 import argparse
 import functools
-import itertools
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,14 +36,11 @@ import numpy as np
 import torch
 
 from polarnet.analysis.event_budget import sequence_at
-from polarnet.benchmark.rows import Context, available, opened, predictions_of
+from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
-from polarnet.methods import METHODS
-from polarnet.methods.between import anchored, carried
-from polarnet.methods.method import Recoverer, clamped
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
@@ -62,15 +55,10 @@ from studies.study import arguments_of, command_line, machine_record, row_of, wr
 
 OURS = "ours"
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
-HELD, ENDS = ", held", ", window ends"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
-RATE_HZ = 2000
-RATED = f"time.{RATE_HZ}hz"
-TIMES_BETWEEN = 16
-"""Times between the ends of two windows at which the frames of a rate are scored."""
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 SENSORS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -130,10 +118,6 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
             measured = ingested(root, work / name, *all_test)
             conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
     small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
-    scenes = [part for name, of in conditions.items() if name.startswith("measured.") for part in of]
-    conditions[f"{RATED}.photographs"] = [(small, ())]
-    if scenes:
-        conditions[f"{RATED}.measured"] = scenes
     conditions |= {f"sensors.{name}": [(small, overrides)] for name, overrides in SENSORS.items()}
     return conditions | {"time.5ms": [(small, ("synthesize.frame_rate_hz=200",))]}
 
@@ -153,7 +137,7 @@ def contexts_of(
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
     config = settings(*overrides)
     contexts = {row: context_of(config, [*ROWS, OURS], train_mean, file) for row, file in weights.items()}
-    variants = {} if condition.startswith(RATED) else {BLOCKS: "methods.ours.binning=2"}
+    variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
@@ -187,26 +171,6 @@ def scored_sequence(
     return Scores(scores, {test.scene: float(truth.mean())}, errors)
 
 
-def rated_sequence(name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context]) -> Scores:
-    """Scores of the frames between windows and at their ends, without the windows of the warm-up."""
-    test = simulated(scenes, name, config)
-    warmup, cpu = warmup_windows(config), torch.device("cpu")
-    spans = list(itertools.pairwise(test.t_us.tolist()))[warmup + 1 :]
-    times = [
-        round(start + (stop - start) * (k + 0.5) / TIMES_BETWEEN) for start, stop in spans for k in range(TIMES_BETWEEN)
-    ]
-    later = sequence_at(scenes, name, test.events, torch.tensor([0, *times]))
-    predictions = predictions_of(["oracle_mean"], later, next(iter(contexts.values())))
-    at_ends = {}
-    for row, context in contexts.items():
-        at_ends[row + ENDS], predictions[row], predictions[row + HELD] = frames_between(
-            test, times, opened(METHODS[OURS], context), config
-        )
-    rows = score_sequence(later, predictions, 0, None, cpu) + score_sequence(test, at_ends, warmup, None, cpu)
-    truth = later.dolp if later.valid is None else later.dolp[later.valid]
-    return Scores(rows, {rows[0].scene: float(truth.mean())}, {})
-
-
 def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
     """A stored scene with the events of the configured camera, which moves as when the scene was made."""
     record = scenes.read(name)
@@ -216,33 +180,6 @@ def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
     size = scenes.sensor_height, scenes.sensor_width
     events = emulate_motion(config.camera.drawn(config.seed, name), scene, trajectory, int(t_us[-1]), size, 1)
     return sequence_at(scenes, name, events, t_us)
-
-
-@torch.no_grad()
-def frames_between(
-    sequence: TestSequence, times_us: Sequence[int], recoverer: Recoverer, config: Config
-) -> list[Prediction]:
-    """Frames at the ends of the windows; at the increasing times, each window's frame carried on; and held there."""
-    windows = sequence.windows
-    assert times_us[0] >= windows[0].stop_us, "no frame exists before the end of the first window"
-    state, before = recoverer.start(*sequence.dolp.shape[1:]), None
-    at_ends, on, held = [], [], []
-    for window, end_us in zip(windows, [*(one.stop_us for one in windows[1:]), times_us[-1] + 1], strict=True):
-        state, prediction = recoverer.step(state, [window])
-        frame = Prediction(*(None if field is None else field[0].cpu() for field in prediction))  # type: ignore[arg-type]
-        before = anchored(before, window, frame, config.between)
-        at_ends.append(frame)
-        for time_us in (t for t in times_us if window.stop_us <= t < end_us):
-            before, later = carried(before, sequence.events, time_us, config.between)
-            on.append(later)
-            held.append(frame)
-    return [joined(frames) for frames in (at_ends, on, held)]
-
-
-def joined(frames: Sequence[Prediction]) -> Prediction:
-    """DoLP, AoLP and log-variance of several frames, stacked."""
-    maps = [None if fields[0] is None else torch.stack(fields) for fields in list(zip(*frames, strict=True))[:3]]
-    return clamped(Prediction(*maps))  # type: ignore[arg-type]
 
 
 def warmup_windows(config: Config) -> int:
@@ -292,10 +229,6 @@ def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
             if name.startswith("sensors.")
         }
         figures["sensors"] = {"worst_over_default": max(relative.values())}
-    rated = [table["rows"] for name, table in tables.items() if name.startswith(RATED)]
-    if rated:
-        lost = max(rows[row + ENDS]["psnr"] - rows[row]["psnr"] for rows in rated)
-        figures["time"] = {f"db_lost_{RATE_HZ}hz": lost}
     return figures
 
 
@@ -318,11 +251,9 @@ def tables_of(
                 contexts_of(name, (*common, *overrides), train_mean, weights),
             )
             scenes = scenes_of(images, config)
-            task: Callable[[str], Scores] = functools.partial(
+            task = functools.partial(
                 scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant
             )
-            if name.startswith(RATED):
-                task = functools.partial(rated_sequence, scenes=scenes, config=config, contexts=contexts)
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])

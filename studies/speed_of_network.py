@@ -1,8 +1,8 @@
 """Speed of the shipped network: python -m studies.speed_of_network [--weights FILE] [--threads N] [--write]
 
 For each size of sensor, windows a second on random events, many at once as in a file and one by one as from a camera,
-with and without blocks of 2x2 pixels (`methods.ours.binning=2`), and ms of a frame between windows (`polarnet recover
---rate 2000`). --write puts the figures into docs/results/robustness.json under `speed`.
+with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write puts the figures into
+docs/results/robustness.json under `speed`.
 """
 
 import json
@@ -16,21 +16,17 @@ import torch
 from polarnet.config.tree import load
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
-from polarnet.methods.between import BetweenConfig, anchored, carried
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.machine import configure, precision_on, usable_cores
-from polarnet.stokes import Prediction
 from studies.study import ROOT, arguments_of, command_line, machine_record, write_section
 
 SIZES = ((120, 180), (260, 346), (480, 640))
 RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
 CPU = torch.device("cpu")
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
-FRAME_RATE_HZ, RATE_HZ = 30, 2000
-WINDOW_US = round(1e6 / FRAME_RATE_HZ)
-VELOCITY = (1e-4, -0.7e-4)  # pixels per microsecond, 4 pixels a window
+WINDOW_US = round(1e6 / 30)
 
 
 def windows_per_s(weights: Path, height: int, width: int, binning: int | None) -> dict[str, float]:
@@ -72,23 +68,6 @@ def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
     return list(cutter.add(channels, windows * WINDOW_US))
 
 
-@torch.inference_mode()
-def ms_between(height: int, width: int, config: BetweenConfig) -> float:
-    """Ms of computation for a frame of the rate, on random events; the search of the motion is shared by a window."""
-    channels = random_channels(height, width, 3)
-    first, second = windows_of(channels, 2)
-    stokes = torch.rand(2, height, width, generator=torch.Generator().manual_seed(0)) - 0.5
-    frame = Prediction(torch.hypot(*stokes), torch.zeros(height, width), torch.zeros(height, width), stokes)
-    frames = round(RATE_HZ / FRAME_RATE_HZ)
-    state = anchored(None, first, frame, config)
-    start = time.perf_counter()
-    state = anchored(state, second, frame, config)
-    state = state._replace(velocity=torch.tensor(VELOCITY))  # random events confirm none
-    for number in range(1, frames + 1):
-        state, _ = carried(state, channels, second.stop_us + round(1e6 * number / RATE_HZ), config)
-    return round(1000 * (time.perf_counter() - start) / frames, 3)
-
-
 def main() -> None:
     """Measure, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/robustness.json")
@@ -103,7 +82,6 @@ def main() -> None:
         speed["sizes"][f"{height} x {width}"] = {
             "pixels": windows_per_s(arguments.weights, height, width, None),
             "blocks": windows_per_s(arguments.weights, height, width, 2),
-            "ms_between": ms_between(height, width, config.between),
         }
     print(json.dumps(speed, indent=1))
     if arguments.write:

@@ -113,7 +113,7 @@ def row_of(row: str, file: Path) -> str:
 
 SCORES = (
     "mse", "psnr", "ssim", "lpips", "lpips_backbone", "level_mse", "pattern_mse", "corr", "grad", "skill", "aolp_deg",
-    "ms_per_window", "gflop", "params", "peak_mib",
+    "ms_per_window", "gflop", "params",
 )  # fmt: skip
 """Scores and costs that docs/results keeps of a row; the intervals stay in metrics.json."""
 

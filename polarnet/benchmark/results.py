@@ -5,6 +5,7 @@ ROW/SET/results.json         scores of each frame, cost, sums of the expected er
 ROW/SET/panels/SEQUENCE.npz  one window: its events, the truth and the row's prediction
 """
 
+import csv
 import dataclasses
 import json
 import shutil
@@ -14,9 +15,16 @@ from typing import Any, NamedTuple
 
 import torch
 
-from polarnet.benchmark.paired import paired_comparisons
 from polarnet.benchmark.run import Benchmark
-from polarnet.benchmark.score import METRICS, BenchmarkConfig, Cost, FrameScore, scene_means, summary, write_frames
+from polarnet.benchmark.score import (
+    METRICS,
+    BenchmarkConfig,
+    Cost,
+    FrameScore,
+    paired_comparisons,
+    scene_means,
+    summary,
+)
 from polarnet.metrics.reliability import Reliability
 from polarnet.runtime.files import check_seal, publish, seal
 from polarnet.storage.panels import read_panel, write_panel
@@ -78,19 +86,17 @@ def read_rows(folders: Mapping[str, Path], test_set: str) -> Benchmark:
     """
     rows = {row: _read_row(row, folder / test_set) for row, folder in folders.items()}
     first = next(iter(rows))
-    sequences, shown = _sequences(rows[first])
     for row, results in rows.items():
-        if _sequences(results) != (sequences, shown):
+        if _sequences(results) != _sequences(rows[first]):
             raise ValueError(
                 f"row {row} was scored on other sequences of set {test_set} than row {first}: run both again, {MADE_BY}"
             )
+    sequences, _ = _sequences(rows[first])
     ordered = [score for name in sequences for one in rows.values() for score in one.rows if score.sequence == name]
-    by_sequence = [{panel.sequence: panel for panel in one.panels} for one in rows.values()]
     panels = []
-    for name in sequences:
-        if name in shown:
-            predictions = {row: one for panels_of in by_sequence for row, one in panels_of[name].predictions.items()}
-            panels.append(dataclasses.replace(by_sequence[0][name], predictions=predictions))
+    for of_rows in zip(*(one.panels for one in rows.values()), strict=True):
+        predictions = {row: panel.predictions[row] for row, panel in zip(rows, of_rows, strict=True)}
+        panels.append(dataclasses.replace(of_rows[0], predictions=predictions))
     costs = {row: one.costs[row] for row, one in rows.items()}
     sums = {row: one.reliability[row] for row, one in rows.items() if row in one.reliability}
     return Benchmark(ordered, costs, panels, sums)
@@ -108,9 +114,9 @@ def _read_row(row: str, folder: Path) -> Benchmark:
     return Benchmark(scores, {row: Cost(**results["cost"])}, panels, {row: Reliability(*sums)} if sums else {})
 
 
-def _sequences(results: Benchmark) -> tuple[list[str], set[str]]:
-    """Sequences of a row in order, and those with a panel."""
-    return list(dict.fromkeys(score.sequence for score in results.rows)), {panel.sequence for panel in results.panels}
+def _sequences(results: Benchmark) -> tuple[list[str], list[str]]:
+    """Sequences of a row, and those with a panel."""
+    return list(dict.fromkeys(score.sequence for score in results.rows)), [panel.sequence for panel in results.panels]
 
 
 def write_benchmark(
@@ -144,7 +150,8 @@ def write_benchmark(
     }
     for name, content in (("metrics", metrics), ("cost", costs), ("details", details)):
         (folder / f"{name}.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-    write_frames(folder / "frames.csv", benchmark.rows)
+    with (folder / "frames.csv").open("w", newline="") as file:  # metrics that were not computed are empty cells
+        csv.writer(file, lineterminator="\n").writerows([FrameScore._fields, *benchmark.rows])
     for panel in benchmark.panels:
         write_panel(folder / "panels", panel)
     return {method: {**metrics[method], **costs[method]} for method in metrics}

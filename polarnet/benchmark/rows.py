@@ -11,7 +11,7 @@ from torch import Tensor
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS, ROWS
-from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_file, weights_record, why_absent
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, joined, weights_record, why_absent
 from polarnet.metrics.references import REFERENCES, Reference
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
@@ -27,44 +27,45 @@ class Context:
     train_mean: float | None
     """Mean DoLP of the training split; None without a training split."""
     setups: Mapping[str, Setup]
-    """Setup by section of `methods` in params.yaml."""
+    """Setup by section of `methods` in params.yaml, which NAME+gain shares with NAME."""
     device: torch.device
     """Device that computes the scores."""
-
-    def setup_of(self, method: Method) -> Setup:
-        """Setup of a method; NAME+gain shares the setup of NAME."""
-        return self.setups[method.section]
 
 
 @torch.no_grad()
 def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
-    """Prediction by row, one frame per window, on the CPU."""
-    return {name: each_map(_predicted(name, sequence, context), Tensor.cpu) for name in names}
+    """Prediction by row, one frame per window, on the CPU; ValueError for a value that is no number."""
+    predictions = {}
+    for name in names:
+        if name in REFERENCES:
+            prediction = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
+        else:
+            method = METHODS[name]
+            prediction = _run(opened(method, context), sequence.windows_for(method.rotating))
+        predictions[name] = each_map(prediction, Tensor.cpu)
+        for maps in prediction:
+            if maps is not None and not (finite := maps.isfinite().flatten(1).all(1)).all():
+                raise ValueError(
+                    f"{name} on {sequence.name}, window {int((~finite).nonzero()[0])}: it predicted values that are "
+                    f"not numbers; the method, its weights or the events are damaged"
+                )
+    return predictions
 
 
-def _predicted(name: str, sequence: TestSequence, context: Context) -> Prediction:
-    if name in REFERENCES:
-        return REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
-    method = METHODS[name]
-    prediction = run(opened(method, context), sequence.windows_for(method.rotating))
-    return prediction._replace(stokes=None, intensities=None)
-
-
-def run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
-    """Run a method over consecutive windows from its initial state, one window at a time as from a camera."""
+def _run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
+    """DoLP, AoLP and expected error over consecutive windows, one window at a time as from a camera."""
     first = windows[0].channels[0]
     state = recoverer.start(first.height, first.width)
-    frames: list[Prediction] = []
+    frames = []
     for window in windows:
         state, prediction = recoverer.step(state, [window])
-        frames.append(prediction)
-    joined = [None if fields[0] is None else torch.cat(fields) for fields in zip(*frames, strict=True)]
-    return Prediction(*joined)  # type: ignore[arg-type]
+        frames.append(prediction._replace(stokes=None, intensities=None))
+    return joined(frames)
 
 
 def opened(method: Method, context: Context) -> Recoverer:
     """The method, ready to run; cached while its settings and weights file are unchanged."""
-    setup = context.setup_of(method)
+    setup = context.setups[method.section]
     written = setup.weights.stat().st_mtime_ns if setup.weights is not None and setup.weights.exists() else None
     return _opened(method, setup, written)
 
@@ -86,20 +87,16 @@ def why_left_out(name: str, context: Context) -> str | None:
     if isinstance(row, Reference):
         missing = row.needs_train_mean and context.train_mean is None
         return "the training split is not there; run `dvc repro synthesize`" if missing else None
-    return why_absent(row, context.setup_of(row))
+    return why_absent(row, context.setups[row.section])
 
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:
     """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights."""
-    return {method.section: weights_record(method, setup) for method, setup in _with_weights(names, context)}
+    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].networks]
+    return {method.section: weights_record(method, context.setups[method.section]) for method in methods}
 
 
 def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
     """Checkpoint metadata by section of `methods`, for the rows with a checkpoint of polarnet."""
-    paths = {method.section: weights_file(setup) for method, setup in _with_weights(names, context)}
-    return {row: load_checkpoint(path)[1] for row, path in paths.items() if path.suffix == ".safetensors"}
-
-
-def _with_weights(names: Sequence[str], context: Context) -> list[tuple[Method, Setup]]:
-    methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].weights is not None]
-    return [(method, context.setup_of(method)) for method in methods]
+    paths = {section: context.setups[section].weights for section in weights_used(names, context)}
+    return {row: load_checkpoint(path)[1] for row, path in paths.items() if path and path.suffix == ".safetensors"}

@@ -1,8 +1,10 @@
 """Run every method on every sequence of a test set, score it, measure its cost and keep panels."""
 
+import functools
+import operator
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -19,6 +21,7 @@ from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, s
 
 MAX_FILM_FRAMES = 12
 """Frames of the report's player for each scene; they keep a page of 50 scenes below 30 MB."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -30,30 +33,6 @@ class Benchmark:
     panels: Sequence[Panel]
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
     """Reliability of the expected errors, for the methods that predict them."""
-
-
-@dataclass(frozen=True)
-class _Measurement:
-    """Runs and scores the rows on one sequence after another; each call is a task of its own."""
-
-    test_set: BenchmarkSet
-    context: Context
-    config: BenchmarkConfig
-    lpips: Lpips | None
-    with_panel: Collection[str]
-    """Sequences that get a panel."""
-
-    def __call__(self, name: str) -> Benchmark:
-        """Results of every row on a sequence, which is read once; without costs."""
-        sequence = self.test_set.sequence(name)
-        predictions = {
-            row: at_stored_precision(row, name, prediction)
-            for row, prediction in predictions_of(self.config.methods, sequence, self.context).items()
-        }
-        warmup = self.config.warmup_windows
-        rows = score_sequence(sequence, predictions, warmup, self.lpips, self.context.device)
-        panels = [panel_of(sequence, predictions, warmup)] if name in self.with_panel else []
-        return Benchmark(rows, {}, panels, _reliability(sequence, predictions, warmup))
 
 
 def run_benchmark(
@@ -71,73 +50,77 @@ def run_benchmark(
     from polarnet.benchmark.cost import cost_of  # torch's counter of operations takes a second to import
 
     names = test_set.sequences
-    scenes = {name: test_set.frames.original_of(name) for name in names}
-    lpips = None if lpips is None else lpips.to(context.device)
-    measure = _Measurement(test_set, context, config, lpips, _spread(scenes, config.panel_scenes))
-    results: list[Benchmark] = list(mapper(measure, names))
+    firsts: dict[str, str] = {}
+    for name in names:
+        firsts.setdefault(test_set.frames.original_of(name), name)
+    score = functools.partial(
+        _scored,
+        test_set=test_set,
+        context=context,
+        config=config,
+        lpips=None if lpips is None else lpips.to(context.device),
+        with_panel=_spread([*firsts.values()], config.panel_scenes),
+    )
+    results: list[Benchmark] = list(mapper(score, names))
     first = test_set.sequence(names[0])
     costs = {row: cost_of(row, first, context) for row in config.methods}
-    sums: dict[str, Reliability] = {}
-    for result in results:
-        for method, here in result.reliability.items():
-            sums[method] = sums[method] + here if method in sums else here
+    sums = {
+        row: functools.reduce(operator.add, (result.reliability[row] for result in results))
+        for row in results[0].reliability
+    }
     rows = [row for result in results for row in result.rows]
     return Benchmark(rows, costs, [panel for result in results for panel in result.panels], sums)
 
 
-def at_stored_precision(row: str, sequence: str, prediction: Prediction) -> Prediction:
-    """The prediction in the steps of the stored truth: DoLP 1/65535, AoLP pi/65536; log-variance as float16.
+def _scored(
+    name: str,
+    test_set: BenchmarkSet,
+    context: Context,
+    config: BenchmarkConfig,
+    lpips: Lpips | None,
+    with_panel: Collection[str],
+) -> Benchmark:
+    """Results of every row on a sequence, which is read once; without costs."""
+    sequence, warmup = test_set.sequence(name), config.warmup_windows
+    predictions = predictions_of(config.methods, sequence, context)
+    predictions = {row: at_stored_precision(prediction) for row, prediction in predictions.items()}
+    rows = score_sequence(sequence, predictions, warmup, lpips, context.device)
+    panels = [panel_of(sequence, predictions, warmup)] if name in with_panel else []
+    valid = None if sequence.valid is None else sequence.valid[warmup:]
+    sums = {
+        row: reliability(one.log_variance[warmup:], one.dolp[warmup:], sequence.dolp[warmup:], valid)
+        for row, one in predictions.items()
+        if one.log_variance is not None
+    }
+    return Benchmark(rows, {}, panels, sums)
 
-    ValueError, naming the row and the window, if a value is not finite.
-    """
-    for frames in (prediction.dolp, prediction.aolp, prediction.log_variance):
-        if frames is not None and not (finite := frames.isfinite().flatten(1).all(dim=1)).all():
-            raise ValueError(
-                f"{row} on {sequence}, window {int((~finite).nonzero()[0])}: it predicted values that are not "
-                f"numbers; the method, its weights or the events are damaged"
-            )
-    dolp = dequantise_fraction(quantise_fraction(prediction.dolp))
+
+def at_stored_precision(prediction: Prediction) -> Prediction:
+    """The prediction in the steps of the stored truth: DoLP 1/65535, AoLP pi/65536; log-variance as float16."""
     aolp, log_variance = prediction.aolp, prediction.log_variance
     return Prediction(
-        dolp,
+        dequantise_fraction(quantise_fraction(prediction.dolp)),
         None if aolp is None else dequantise_angle(quantise_angle(aolp.remainder(torch.pi))),
         None if log_variance is None else log_variance.clamp(LOWEST, HIGHEST).half().float(),
     )
 
 
-def _spread(scenes: Mapping[str, str], count: int) -> set[str]:
-    """First sequence of each of `count` scenes, spread evenly over the split, both ends included; `scenes` by name."""
-    first = list({scenes[name]: name for name in reversed([*scenes])}.values())[::-1]
-    count = min(count, len(first))
-    return {first[round(i * (len(first) - 1) / max(count - 1, 1))] for i in range(count)}
-
-
-def _reliability(
-    sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int
-) -> dict[str, Reliability]:
-    """Reliability over the scored windows, for each method that predicts its error."""
-    windows = slice(scored_windows(sequence, warmup_windows).start, None)
-    valid = None if sequence.valid is None else sequence.valid[windows]
-    truth = sequence.dolp[windows]
-    return {
-        method: reliability(prediction.log_variance[windows], prediction.dolp[windows], truth, valid)
-        for method, prediction in predictions.items()
-        if prediction.log_variance is not None
-    }
+def _spread(values: Sequence[Item], count: int) -> list[Item]:
+    """At most `count` of the values, spread evenly, both ends included."""
+    count = min(count, len(values))
+    return [values[round(i * (len(values) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 def panel_of(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int) -> Panel:
     """Panel of the middle scored window, with a film of windows spread evenly over the scored ones."""
     scored, windows = scored_windows(sequence, warmup_windows), sequence.windows
     k = scored[len(scored) // 2]
-    count = min(MAX_FILM_FRAMES, len(scored))
-    film = [scored[round(i * (len(scored) - 1) / max(count - 1, 1))] for i in range(count)]
+    film = _spread(scored, MAX_FILM_FRAMES)
     counts = [torch.stack([polarity_sums(channel) for channel in windows[one].channels]).sum(0) for one in film]
 
     def shown(maps: Prediction) -> Shown:
-        dolp, aolp = maps.dolp, maps.aolp
-        angles = (None, None) if aolp is None else (aolp[k], angle_bytes(aolp[film]))
-        return Shown(dolp[k], angles[0], fraction_bytes(dolp[film]), angles[1])
+        aolp, film_aolp = (None, None) if maps.aolp is None else (maps.aolp[k], angle_bytes(maps.aolp[film]))
+        return Shown(maps.dolp[k], aolp, fraction_bytes(maps.dolp[film]), film_aolp)
 
     return Panel(
         sequence.name,

@@ -1,15 +1,13 @@
-"""Scores of predictions: one row per frame, means over frames and then scenes, with bootstrap intervals."""
+"""Scores of predictions: one row per frame, means over frames and then scenes with intervals, paired comparisons."""
 
-import csv
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from pydantic import Field, NonNegativeInt
 from torch import Tensor
 
@@ -19,15 +17,11 @@ from polarnet.metrics.lpips import BACKBONES
 from polarnet.metrics.similarity import (
     MIN_MSE,
     Lpips,
-    aolp_error_deg,
-    correlation,
+    frame_scores,
     gradient_agreement,
     level_mse,
-    mse,
     pattern_mse,
-    psnr,
     spread_mse,
-    ssim,
     with_truth_outside,
 )
 from polarnet.runtime.machine import generator_for
@@ -94,6 +88,9 @@ class FrameScore(NamedTuple):
     """MSE of the true frame's mean: not a score, but the reference of the skill."""
 
 
+SCORES = FrameScore._fields[FrameScore._fields.index("mse") :]
+
+
 @dataclass(frozen=True)
 class Cost:
     """Cost of a method; times and arithmetic are per window of all four channels."""
@@ -104,8 +101,6 @@ class Cost:
     """Convolutions, matrix products and attention; a multiply-add counts as 2. None for a method without a network."""
     params: int
     """Parameters of the method's networks."""
-    peak_mib: float
-    """Peak memory of tensors and arrays over the first windows, without the sequence itself."""
 
 
 def scored_windows(sequence: TestSequence, warmup_windows: int) -> range:
@@ -129,57 +124,40 @@ def score_sequence(
     """One row per method and window after the warm-up; `predictions` hold one frame per window.
 
     Scores are computed on `device`, where `lpips` must be. Invalid pixels are excluded from all scores except LPIPS,
-    which sees the truth there instead of the prediction.
-
-    ValueError, naming the frame, if a score is not finite or a frame has no valid pixel: frames are never left out.
+    which sees the truth there instead of the prediction. ValueError, naming the frame, if no pixel is valid.
     """
     windows = scored_windows(sequence, warmup_windows)
-    for method, prediction in predictions.items():
-        for frames in (prediction.dolp, prediction.aolp):
-            if frames is not None and frames.shape != sequence.dolp.shape:
-                raise ValueError(
-                    f"{method} on {sequence.name}: expected frames of {tuple(sequence.dolp.shape)}, "
-                    f"got {tuple(frames.shape)}"
-                )
 
     def scored(frames: Tensor | None) -> Any:
         return None if frames is None else frames[warmup_windows:].to(device)
 
-    counted = {method: (scored(one.dolp), scored(one.aolp)) for method, one in predictions.items()}
-    truth, true_aolp, valid = scored(sequence.dolp), scored(sequence.aolp), scored(sequence.valid)
+    counted = {method: Prediction(scored(one.dolp), scored(one.aolp)) for method, one in predictions.items()}
+    truth, aolp, valid = scored(sequence.dolp), scored(sequence.aolp), scored(sequence.valid)
     if valid is not None and not (known := valid.any(-1).any(-1)).all():
-        window = warmup_windows + int(known.logical_not().nonzero()[0])
+        window = windows[int(known.logical_not().nonzero()[0])]
         raise ValueError(f"{sequence.name}, window {window}: no pixel is valid; leave this measurement out")
-    oracle_mse = spread_mse(truth, valid)
-    compared = {method: with_truth_outside(dolp, truth, valid) for method, (dolp, _) in counted.items()}
-    distances = {} if lpips is None else _lpips_of(compared, truth, lpips)
+    distances = {} if lpips is None else _lpips_of(counted, truth, valid, lpips)
     rows = []
-    for method, (dolp, aolp) in counted.items():
-        per_frame: dict[str, Tensor | None] = {
-            "mse": mse(dolp, truth, valid),
-            "psnr": psnr(dolp, truth, valid),
-            "ssim": ssim(dolp, truth, valid),
-            "lpips": distances.get(method),
-            "corr": correlation(dolp, truth, valid),
-            "grad": gradient_agreement(dolp, truth, valid),
-            "level_mse": level_mse(dolp, truth, valid),
-            "pattern_mse": pattern_mse(dolp, truth, valid),
-            "aolp_deg": None if aolp is None else aolp_error_deg(aolp, true_aolp, truth, valid),
-            "oracle_mse": oracle_mse,
+    for method, prediction in counted.items():
+        scores = {
+            **frame_scores(prediction, truth, aolp, valid),
+            **({"lpips": distances[method]} if method in distances else {}),
+            "grad": gradient_agreement(prediction.dolp, truth, valid),
+            "level_mse": level_mse(prediction.dolp, truth, valid),
+            "pattern_mse": pattern_mse(prediction.dolp, truth, valid),
+            "oracle_mse": spread_mse(truth, valid),
         }
-        columns = {name: values.tolist() for name, values in per_frame.items() if values is not None}
-        for i, window in enumerate(windows):
-            scores: dict[str, Any] = dict.fromkeys(per_frame) | {name: values[i] for name, values in columns.items()}
+        columns = [scores[name].tolist() if name in scores else [None] * len(windows) for name in SCORES]
+        for window, *values in zip(windows, *columns, strict=True):
             t_us = int(sequence.t_us[window + 1])
-            rows.append(_finite(FrameScore(method, sequence.scene, sequence.name, window, t_us, **scores)))
+            rows.append(FrameScore(method, sequence.scene, sequence.name, window, t_us, *values))
     return rows
 
 
 def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, float]]:
-    """Mean of a column or metric over the frames of each scene, by method and scene.
+    """Mean of a column or metric over the frames of each scene, by method and scene, without methods that lack it.
 
-    The skill of a scene is 1 - its MSE / the MSE of the oracle mean. A method without the metric is left out;
-    ValueError if only some of its frames have the metric.
+    The skill of a scene is 1 - its MSE / the MSE of the oracle mean.
     """
     if metric == "skill":
         rows = list(rows)
@@ -188,18 +166,18 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
             method: {scene: _skill(error, oracles[method][scene]) for scene, error in scenes.items()}
             for method, scenes in errors.items()
         }
-    gathered: dict[str, dict[str, list[float | None]]] = {}
+    values: dict[str, dict[str, list[float]]] = {}
+    lacking = set()
     for row in rows:
-        gathered.setdefault(row.method, {}).setdefault(row.scene, []).append(getattr(row, metric))
-    means: dict[str, dict[str, float]] = {}
-    for method, scenes in gathered.items():
-        missing = sum(values.count(None) for values in scenes.values())
-        if missing == sum(map(len, scenes.values())):
-            continue
-        if missing:
-            raise ValueError(f"{method} has no {metric} for {missing} of its frames; a metric leaves no frame out")
-        means[method] = {scene: math.fsum(values) / len(values) for scene, values in sorted(scenes.items())}  # type: ignore[arg-type]
-    return means
+        value = getattr(row, metric)
+        values.setdefault(row.method, {}).setdefault(row.scene, []).append(value)
+        if value is None:
+            lacking.add(row.method)
+    return {
+        method: {scene: math.fsum(of_scene) / len(of_scene) for scene, of_scene in sorted(scenes.items())}
+        for method, scenes in values.items()
+        if method not in lacking
+    }
 
 
 def mean_scores(rows: Sequence[FrameScore], metrics: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -219,39 +197,84 @@ def summary(
     All sequences of one source picture form one scene, since they are not independent. All methods and metrics use
     the same resampled scenes. Skill is 1 - mean MSE / mean MSE of the oracle mean over the same scenes. This ratio of
     means keeps a scene with little variation from outweighing all others. A metric that was not computed is None and
-    has no interval. ValueError if a method lacks a scene.
+    has no interval.
     """
-    methods = list(dict.fromkeys(row.method for row in rows))
-    scenes = sorted({row.scene for row in rows})
-    generator = generator_for(seed, "benchmark", "bootstrap")
-    resampled = generator.integers(0, len(scenes), (bootstrap_samples, len(scenes)))
-    table: dict[str, dict[str, float | list[float] | None]] = {method: {} for method in methods}
+    scenes = len({row.scene for row in rows})
+    resampled = generator_for(seed, "benchmark", "bootstrap").integers(0, scenes, (bootstrap_samples, scenes))
+    table: dict[str, dict[str, float | list[float] | None]] = {row.method: {} for row in rows}
     oracles = scene_means(rows, "oracle_mse")
     for metric in METRICS:
         means = scene_means(rows, "mse" if metric == "skill" else metric)
-        for method in methods:
+        for method, scores in table.items():
             if method not in means:
-                table[method][metric] = None
+                scores[metric] = None
                 continue
-            if list(means[method]) != scenes:
-                raise ValueError(f"{method} has no score for {sorted(set(scenes) - set(means[method]))}")
-            values = np.array(list(means[method].values()))
+            values, oracle = (np.array(list(of[method].values())) for of in (means, oracles))
             mean, samples = values.mean(), values[resampled].mean(axis=1)
             if metric == "skill":
-                oracle = np.array(list(oracles[method].values()))
                 mean = _skill(mean, oracle.mean())
                 samples = _skill(samples, oracle[resampled].mean(axis=1))
-            table[method][metric] = float(mean)
-            table[method][f"{metric}_ci"] = np.quantile(samples, INTERVAL).tolist()
+            scores |= {metric: float(mean), f"{metric}_ci": np.quantile(samples, INTERVAL).tolist()}
     return table
 
 
-def write_frames(path: Path, rows: Iterable[FrameScore]) -> None:
-    """Write rows as CSV with a header; metrics that were not computed are empty cells."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(FrameScore._fields)
-        writer.writerows(rows)
+PAIRED_METRICS = {
+    "mse": "low", "psnr": "high", "ssim": "high", "lpips": "low", "corr": "high", "grad": "high",
+    "pattern_mse": "low", "aolp_deg": "low",
+}  # fmt: skip
+"""Metrics to compare, and whether lower or higher is better."""
+
+
+def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Compare `method` with every other method in `rows`, metric by metric; empty if `rows` lack `method`.
+
+    Each scene gives one pair: the two methods' means over its frames. A comparison holds
+
+    - `scenes`: number of scenes, and `better`: number of scenes where `method` is better;
+    - `median_difference`: `method` minus the other method, in the unit of the metric;
+    - `effect`: rank-biserial correlation of the pairs (Kerby, Comprehensive Psychology 2014): 1 if `method` is better
+      in every scene, -1 if it is worse in every scene, 0 if neither stands out;
+    - `p`: two-sided p-value of Wilcoxon's signed-rank test (exact up to 50 scenes without ties), and `p_holm`: the
+      same after Holm's correction (1979) for the number of other methods.
+
+    The test has little power with few scenes: with five, the smallest possible p is 0.0625.
+    """
+    rows = list(rows)
+    means = {metric: scene_means(rows, metric) for metric in PAIRED_METRICS}
+    rivals = [name for name in dict.fromkeys(row.method for row in rows) if name != method]
+    table: dict[str, dict[str, dict[str, Any]]] = {rival: {} for rival in rivals}
+    for metric, better in PAIRED_METRICS.items():
+        of = means[metric]
+        if method not in of:
+            continue
+        for rival in [name for name in rivals if name in of]:
+            difference = np.array([value - of[rival][scene] for scene, value in of[method].items()])
+            table[rival][metric] = compared(difference if better == "high" else -difference) | {
+                "median_difference": float(np.median(difference))
+            }
+        _correct([table[rival][metric] for rival in rivals if metric in table[rival]])
+    return {rival: scores for rival, scores in table.items() if scores}
+
+
+def compared(gains: Float64[np.ndarray, " scenes"]) -> dict[str, Any]:
+    """`scenes`, `better`, `effect` and `p` from the gain in each scene; a gain of 0 counts for neither method."""
+    from scipy.stats import rankdata, wilcoxon  # a second, which every stage would pay
+
+    moved = gains[gains != 0]
+    effect, p = 0.0, 1.0
+    if len(moved):
+        ranks = rankdata(np.abs(moved))
+        effect = float((ranks * np.sign(moved)).sum() / ranks.sum())
+        p = float(wilcoxon(moved).pvalue)
+    return {"scenes": len(gains), "better": int((gains > 0).sum()), "effect": effect, "p": p}
+
+
+def _correct(comparisons: Sequence[dict[str, Any]]) -> None:
+    """Add `p_holm`: the k-th smallest of n p-values times n + 1 - k, at most 1 and never decreasing in k."""
+    reached = 0.0
+    for i, comparison in enumerate(sorted(comparisons, key=lambda comparison: comparison["p"])):
+        reached = max(reached, min(1.0, comparison["p"] * (len(comparisons) - i)))
+        comparison["p_holm"] = reached
 
 
 def _skill(error: Any, oracle: Any) -> Any:
@@ -260,30 +283,17 @@ def _skill(error: Any, oracle: Any) -> Any:
 
 
 def _lpips_of(
-    recovered: Mapping[str, Float[Tensor, "n h w"]], truth: Float[Tensor, "n h w"], lpips: Lpips
+    predictions: Mapping[str, Prediction], truth: Float[Tensor, "n h w"], valid: Tensor | None, lpips: Lpips
 ) -> dict[str, Float[Tensor, " n"]]:
-    parts: dict[str, list[Tensor]] = {method: [] for method in recovered}
+    """Distances by method. Features of the truth are computed once for all methods, those of a constant once."""
+    frames = {method: with_truth_outside(one.dolp, truth, valid) for method, one in predictions.items()}
+    parts: dict[str, list[Tensor]] = {method: [] for method in frames}
     for start in range(0, len(truth), FRAMES_AT_ONCE):
         chunk = slice(start, start + FRAMES_AT_ONCE)
         of_truth = lpips.features(truth[chunk])
-        for method, frames in recovered.items():
-            parts[method].append(lpips.distance(_features_of(frames[chunk], lpips), of_truth))
+        for method, recovered in frames.items():
+            some = recovered[chunk]
+            constant = torch.equal(some, some[:1].expand_as(some))
+            features = lpips.features(some[:1] if constant else some)
+            parts[method].append(lpips.distance([one.expand(len(some), -1, -1, -1) for one in features], of_truth))
     return {method: torch.cat(distances) for method, distances in parts.items()}
-
-
-def _features_of(frames: Float[Tensor, "n h w"], lpips: Lpips) -> list[Float[Tensor, "n _c _h _w"]]:
-    """LPIPS features of frames, computed only once if all frames are equal (constant predictions)."""
-    if torch.equal(frames, frames[:1].expand_as(frames)):
-        return [features.expand(len(frames), -1, -1, -1) for features in lpips.features(frames[:1])]
-    return lpips.features(frames)
-
-
-def _finite(row: FrameScore) -> FrameScore:
-    for metric in FrameScore._fields[FrameScore._fields.index("mse") :]:
-        value = getattr(row, metric)
-        if value is not None and not math.isfinite(value):
-            raise ValueError(
-                f"{row.method} on {row.sequence}, window {row.window}: {metric} is {value}; the method or the truth "
-                f"holds values that are not numbers"
-            )
-    return row

@@ -83,18 +83,10 @@ class BenchmarkSet:
     def sequence(self, name: str) -> TestSequence:
         """One sequence with its truth."""
         truth = self.frames.frames(name)
-        i0, _, i90, _ = truth.intensity[1:].unbind(1)
-        return TestSequence(
-            name,
-            self.frames.original_of(name),
-            self.events.read(name),
-            truth.t_us,
-            truth.dolp[1:],
-            truth.aolp[1:],
-            i0 + i90,
-            None if truth.valid is None else truth.valid[1:],
-            None if self.rotating is None else self.rotating.read(name)[0],
-        )
+        valid = None if truth.valid is None else truth.valid[1:]
+        rotating = None if self.rotating is None else self.rotating.read(name)[0]
+        scene, events, s0 = self.frames.original_of(name), self.events.read(name), truth.intensity[1:, ::2].sum(1)
+        return TestSequence(name, scene, events, truth.t_us, truth.dolp[1:], truth.aolp[1:], s0, valid, rotating)
 
 
 def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:

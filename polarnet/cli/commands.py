@@ -191,7 +191,7 @@ def _recover(command: AddCommand) -> None:
         'recover recording.aedat4 --mosaic "90 45 / 135 0"',
         "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
         "recover outputs/simulate/lake/events.zarr --truth",
-        "recover data/events.zarr --sequence lake-0 --rate 2000 --write mp4",
+        "recover data/events.zarr --sequence lake-0 --step 1ms --write mp4",
         "recover camera.raw --rotating 15",
         'recover dv://camera --live --mosaic "90 45 / 135 0"',
         description="""\
@@ -225,7 +225,6 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
         "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"
     )
     add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
-    add("--rate", type=float, metavar="HZ", help="frames a second: events carry each frame on to the next window")
     add("--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ...")
     add("--weights", type=Path, metavar="FILE", help="checkpoint of the method's network (default: the shipped one)")
     add(

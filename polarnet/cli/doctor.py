@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import psutil
 import torch
 
-from polarnet.metrics.lpips import BACKBONES, local_source
+from polarnet.metrics.lpips import BACKBONES, installed_version
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
@@ -53,7 +53,7 @@ def _or_error(finding: Callable[[], str]) -> str:
 
 
 def _lpips(backbone: str) -> str:
-    return f"{backbone}: {local_source(backbone, None)}"
+    return f"{backbone}: {installed_version(backbone)}"
 
 
 def _shipped() -> str:

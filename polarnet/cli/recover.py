@@ -18,7 +18,6 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import detect_format, read_recording
 from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
-from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
 from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
@@ -33,7 +32,7 @@ ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
 """Options that say where the polarizers are."""
 NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", *READING)
 NOT_ROTATING = (
-    "angles", "mosaic", "sequence", "truth", "rate", "method", "weights", "thresholds", "binning", "window", *CLEANING,
+    "angles", "mosaic", "sequence", "truth", "method", "weights", "thresholds", "binning", "window", *CLEANING,
 )  # fmt: skip
 """Options without a meaning for live input, and for one camera behind a rotating polarizer."""
 
@@ -47,10 +46,6 @@ def run(options: argparse.Namespace) -> None:
     method = options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD)
     settings = options.weights, options.precision, options.thresholds, options.binning, rotation
     recoverer, words = open_method(ChosenMethod(method, *settings), setup)
-    rate = None
-    if options.rate is not None:
-        check_rate(options.rate, rule, recoverer)
-        rate = Rate(options.rate, config.between.with_thresholds(options.thresholds))
     truth = _truth_of(options)
     scores = TruthScores(truth) if truth else None
     out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
@@ -67,12 +62,10 @@ def run(options: argparse.Namespace) -> None:
         drawn = polarized and "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
         writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
-        frames = frames_at_rate(source, rule, recoverer, rate) if rate else frames_of(source, rule, recoverer)
+        frames = frames_of(source, rule, recoverer)
         if scores:
             frames = scores.watch(frames)
         facts = recover(source, rule, words, writer, frames)
-        if rate:
-            facts["rate"] = f"{options.rate:g} frames a second, carried on by the events from window to window"
         if check:
             counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"

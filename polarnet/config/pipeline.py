@@ -35,7 +35,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
 
     A row NAME+gain that is not listed has the weights of NAME.
     """
-    if weights is None and method.weights is not None:
+    if weights is None and method.networks:
         weights = config.weights_of(method.name) or config.weights_of(method.section)
     return Setup(
         config=getattr(config.methods, method.section, None),

@@ -20,9 +20,8 @@ from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import check_overrides, preset_values
 from polarnet.config.origins import Run
 from polarnet.methods import METHODS
-from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import GainConfig, SharpeningConfig
-from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, is_stored, local_source
+from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, installed_version, is_stored
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
@@ -147,7 +146,6 @@ class Config:
     train: TrainConfig
     lpips: LpipsConfig
     methods: MethodsConfig
-    between: BetweenConfig
     baselines: BaselinesConfig
     benchmark: BenchmarkConfig
     rows: dict[RowName, RowConfig]
@@ -204,13 +202,12 @@ class Config:
 
     def _check_files(self) -> None:
         """ValueError for a file outside the folder of data/external that the stage which reads it depends on."""
-        for key, file, folder in (("train.start", self.train.start, "start"), ("lpips.path", self.lpips.path, "lpips")):
-            watched = Path("data", "external", folder)  # of the project, as in dvc.yaml
-            if file is not None and not Path(file).absolute().is_relative_to(watched.absolute()):
-                raise ValueError(
-                    f"{key}: expected a file below {watched}, whose content `dvc repro` follows, got {file}; copy it "
-                    "there (of a checkpoint, the .safetensors and the .json)"
-                )
+        file, watched = self.train.start, Path("data", "external", "start")  # of the project, as in dvc.yaml
+        if file is not None and not Path(file).absolute().is_relative_to(watched.absolute()):
+            raise ValueError(
+                f"train.start: expected a file below {watched}, whose content `dvc repro` follows, got {file}; copy "
+                "the .safetensors and the .json there"
+            )
 
     def _check_baseline(self) -> None:
         """ValueError for a baseline to train whose weights no row uses."""
@@ -312,8 +309,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
         or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        if script != "weights":  # that stage searches for weights and may download them
-            or_exit(lambda: _check_lpips(config))
+        or_exit(lambda: _check_lpips(config))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
@@ -378,8 +374,8 @@ def _file_of(main: Callable[..., None]) -> Path:
     return Path(sys.modules[main.__module__].__file__ or "").resolve()
 
 
-def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
-    """Call `use` with the LPIPS backbone and weights file for a purpose; None if the purpose needs no LPIPS.
+def with_lpips(config: Config, purpose: Purpose, use: Callable[[str], T]) -> T | None:
+    """Call `use` with the LPIPS backbone for a purpose; None if the purpose needs no LPIPS.
 
     The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
     that turn it off.
@@ -393,17 +389,17 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
     if not asking:
         return None
     try:
-        return use(backbone, config.lpips.path_of(backbone))
+        return use(backbone)
     except ValueError as error:
         without = " ".join(f"{key}={off}" for key in asking)
         raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
 
 
 def _check_lpips(config: Config) -> None:
-    """Raise ValueError unless stage `weights` has stored the required weights or can find them without a download."""
+    """Raise ValueError unless stage `weights` has stored the required weights or can find them."""
 
-    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
-        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+    def look(purpose: Purpose, backbone: str) -> bool:
+        return is_stored(config.paths.weights, purpose, backbone) or bool(installed_version(backbone))
 
     for purpose in PURPOSES:
         with_lpips(config, purpose, functools.partial(look, purpose))

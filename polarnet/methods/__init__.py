@@ -16,7 +16,7 @@ def _assembled() -> dict[str, Method]:
     """
     modules = [importlib.import_module(f"{__name__}.{name}") for _, name, _ in pkgutil.iter_modules(__path__)]
     records = [method for module in modules for method in getattr(module, "METHODS", ())]
-    records.sort(key=lambda method: (method.weights is not None, not method.reconstructs))
+    records.sort(key=lambda method: (bool(method.networks), not method.reconstructs))
     by_name = {method.name: method for method in records}
     assert len(by_name) == len(records), f"two methods have one name: {[method.name for method in records]}"
     return by_name

@@ -23,8 +23,8 @@ from polarnet.methods.method import (
     Recoverer,
     Setup,
     State,
-    Weights,
     each_map,
+    network_recoverer,
     no_state,
     weights_file,
     windows_at_once,
@@ -67,11 +67,17 @@ def dolp_recoverer(
     for option, value in (("thresholds", thresholds), ("binning", binning)):
         if value is not None and not isinstance(ready, StokesUNet):
             raise ValueError(f"{option}: expected network polarnet, got {metadata['network']}; leave {option} out")
+    encode = REPRESENTATIONS[metadata["representation"]]
     if binning is not None:
         if not 1 <= binning <= MAX_BINNING:
             raise ValueError(f"binning: expected blocks with a side of 1 to {MAX_BINNING} px, got {binning}")
         ready.binning = binning
-    encode = REPRESENTATIONS[metadata["representation"]] if thresholds is None else _told(ready, thresholds)
+    if thresholds is not None:
+        if not all(0.001 <= threshold <= 10 for threshold in thresholds):
+            raise ValueError(f"thresholds: expected 0.001 to 10 in log intensity (ON, OFF), got {list(thresholds)}")
+        mean = math.sqrt(math.prod(thresholds))
+        ready.scale.given = mean / ready.step
+        encode = weighted_counts([threshold / mean for threshold in thresholds])
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         inputs = torch.stack([_encoded(window, encode) for window in windows])
@@ -80,21 +86,12 @@ def dolp_recoverer(
         return state, each_map(prediction, lambda field: field[:, 0])
 
     def at_once(height: int, width: int) -> int:
-        side = ready.binning if isinstance(ready, StokesUNet) else 1
+        side = getattr(ready, "binning", 1)
         return windows_at_once(height // side, width // side)
 
     recoverer = Recoverer(no_state, predict, network=ready, at_once=at_once)
     trained_us = trained_window_us(metadata)
     return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
-
-
-def _told(network: StokesUNet, thresholds: Sequence[float]) -> Encode:
-    """Give a network the mean of the camera's thresholds; each event counts as its threshold over this mean."""
-    if not all(0.001 <= threshold <= 10 for threshold in thresholds):
-        raise ValueError(f"thresholds: expected 0.001 to 10 in natural-log intensity (ON, OFF), got {list(thresholds)}")
-    mean = math.sqrt(math.prod(thresholds))
-    network.scale.given = mean / network.step
-    return weighted_counts([threshold / mean for threshold in thresholds])
 
 
 def weighted_counts(steps: Sequence[float]) -> Encode:
@@ -124,21 +121,15 @@ def open_e2p(setup: Setup, *, published: bool) -> Recoverer:
     """Open E2P; its authors' weights (`published`) saw one voxel grid of the whole mosaic, polarnet's one a channel."""
     network = load_baseline({"e2p": E2p}, weights_file(setup)).to(setup.device)
 
-    def grid(window: EventWindow) -> Float[Tensor, "bins h w"]:
+    def encode(window: EventWindow) -> Float[Tensor, "1 bins h w"]:
         if published:
-            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins)
-        return interleaved(voxel_grids(window, network.bins))
+            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins).to(setup.device)[None]
+        return interleaved(voxel_grids(window, network.bins)).to(setup.device)[None]
 
-    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        frames = []
-        for window in windows:
-            with setup.autocast():
-                maps, state = network(grid(window).to(setup.device)[None], state)
-            frames.append(maps[0].float())
-        maps = torch.stack(frames)
-        return state, Prediction(maps[:, -1], angle_of(maps))
+    def prediction_of(maps: Float[Tensor, "n 1 maps h w"]) -> Prediction:
+        return Prediction(maps[:, 0, -1], angle_of(maps[:, 0]))
 
-    return Recoverer(no_state, predict, network=network)
+    return network_recoverer(network, setup, encode, prediction_of)
 
 
 METHODS = (
@@ -147,7 +138,7 @@ METHODS = (
         label="E2P",
         colour="#7a5cc4",
         open=functools.partial(open_e2p, published=False),
-        weights=Weights(("e2p",)),
+        networks=("e2p",),
         about="E2P (Mei et al. 2023), a published network from events to polarization.",
     ),
     Method(
@@ -155,14 +146,14 @@ METHODS = (
         label="E2P, published weights",
         colour="#7a5cc4",
         open=functools.partial(open_e2p, published=True),
-        weights=Weights(("e2p",)),
+        networks=("e2p",),
     ),
     Method(
         name="paper",
         label="the paper's network",
         colour="#0ca678",
         open=open_dolp_network,
-        weights=Weights(tuple(NETWORKS)),
+        networks=tuple(NETWORKS),
         about="The network of the paper (its Fig. 6), in polarnet's implementation: events of the four polarizers in, "
         "DoLP out.",
     ),
@@ -172,7 +163,8 @@ METHODS = (
         colour="#d6336c",
         open=open_dolp_network,
         config=DolpNetworkConfig,
-        weights=Weights(tuple(NETWORKS), shipped=True),
+        networks=tuple(NETWORKS),
+        shipped=True,
         about="The DoLP network in use.",
     ),
 )

@@ -69,17 +69,15 @@ def consistent(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known:
 
 def gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig, known: int = 0) -> Float[Tensor, "m 4"]:
     """Gains of each frame after the first `known`, from it and earlier frames; their geometric mean is 1."""
-    ends = range(known + 1, len(intensities) + 1)
-    return torch.stack([_last_gains(intensities[max(0, end - config.window_frames) : end], config) for end in ends])
-
-
-def _last_gains(intensities: Float[Tensor, "n 4 h w"], config: GainConfig) -> Float[Tensor, "4"]:
-    """Gains of the last frame, from all given frames."""
-    frames, _, height, width = intensities.shape
-    size = height * width
-    chosen = torch.arange(0, frames * size, max(1, -(-frames * size // config.pixels)), device=intensities.device)
-    pixels = intensities.flatten(2)[chosen // size, :, chosen % size].double()
-    return solved(pixels * pixels.new_tensor(SIGNS), config)
+    of_frames = []
+    size = intensities[0, 0].numel()
+    for end in range(known + 1, len(intensities) + 1):
+        frames = intensities[max(0, end - config.window_frames) : end]
+        count = len(frames) * size
+        chosen = torch.arange(0, count, max(1, -(-count // config.pixels)), device=frames.device)
+        pixels = frames.flatten(2)[chosen // size, :, chosen % size].double()
+        of_frames.append(solved(pixels * pixels.new_tensor(SIGNS), config))
+    return torch.stack(of_frames)
 
 
 def solved(residuals: Float[Tensor, "n 4"], config: GainConfig) -> Float[Tensor, "4"]:

@@ -5,7 +5,7 @@ ECCV 2020), which takes voxel grids that are not normalised, and CISTA-TC (Liu a
 its authors do not sharpen. Row `e2v` is the one that the pipeline trains.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -18,16 +18,7 @@ from torch.nn import functional as F
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.method import (
-    Method,
-    Recoverer,
-    Setup,
-    SharpeningConfig,
-    State,
-    Weights,
-    no_state,
-    weights_file,
-)
+from polarnet.methods.method import Method, Recoverer, Setup, SharpeningConfig, network_recoverer, weights_file
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2v import ARCHITECTURES
@@ -73,17 +64,14 @@ def intensity_methods(
     def open_network(setup: Setup) -> Recoverer:
         network = load_baseline(networks, weights_file(setup)).to(setup.device)
 
-        def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-            images = []
-            for window in windows:
-                grids = voxel_grids(window, network.bins).to(setup.device)
-                with setup.autocast():
-                    intensity, state = network(normalise_nonzero(grids) if normalised else grids, state)
-                images.append(intensity.float())
-            raw = torch.stack(images)
-            return state, from_intensities(sharper(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
+        def encode(window: EventWindow) -> Float[Tensor, "c bins h w"]:
+            grids = voxel_grids(window, network.bins).to(setup.device)
+            return normalise_nonzero(grids) if normalised else grids
 
-        return Recoverer(no_state, predict, network=network)
+        def prediction_of(raw: Float[Tensor, "n c h w"]) -> Prediction:
+            return from_intensities(sharper(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
+
+        return network_recoverer(network, setup, encode, prediction_of)
 
     method = Method(
         name=name,
@@ -91,7 +79,7 @@ def intensity_methods(
         colour=colour,
         open=open_network,
         sharpened=sharpened,
-        weights=Weights(tuple(networks)),
+        networks=tuple(networks),
         reconstructs=True,
         about=about,
     )

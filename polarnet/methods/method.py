@@ -106,17 +106,28 @@ class Recoverer(NamedTuple):
         Maps are n h w, on the method's device. DoLP is float32, clamped to [0, 1] for all methods.
         """
         state, prediction = self.predict(state, windows)
-        return state, clamped(prediction)
+        aolp, log_variance = (None if x is None else x.float() for x in (prediction.aolp, prediction.log_variance))
+        dolp = prediction.dolp.float().clamp(0, 1)
+        return state, prediction._replace(dolp=dolp, aolp=aolp, log_variance=log_variance)
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights that a method needs."""
+def network_recoverer(
+    network: Any,
+    setup: Setup,
+    encode: Callable[[EventWindow], Tensor],
+    prediction_of: Callable[[Tensor], Prediction],
+) -> Recoverer:
+    """Run a recurrent network on one encoded window after the other; `prediction_of` takes its outputs of n windows."""
 
-    networks: tuple[str, ...]
-    """Names of the networks that a checkpoint of polarnet may hold, as in its JSON."""
-    shipped: bool = False
-    """Whether the package carries weights, which `polarnet recover` uses if it is given none."""
+    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
+        outputs = []
+        for window in windows:
+            with setup.autocast():
+                output, state = network(encode(window), state)
+            outputs.append(output.float())
+        return state, prediction_of(torch.stack(outputs))
+
+    return Recoverer(no_state, predict, network=network)
 
 
 @dataclass(frozen=True)
@@ -135,8 +146,10 @@ class Method:
     """Class of the section `methods.NAME`; None: no section."""
     sharpened: bool = False
     """Whether the method reads section `methods.sharpening`."""
-    weights: Weights | None = None
-    """Weights that the method needs; None: no weights."""
+    networks: tuple[str, ...] = ()
+    """Names of the networks that its weights, a checkpoint of polarnet, may hold; empty: it needs no weights."""
+    shipped: bool = False
+    """Whether the package carries weights, which `polarnet recover` uses if it is given none."""
     rotating: bool = False
     """Whether the method needs the events of one camera behind a rotating polarizer instead of four channels."""
     reconstructs: bool = False
@@ -171,33 +184,32 @@ def weights_file(setup: Setup) -> Path:
 
 def why_absent(method: Method, setup: Setup) -> str | None:
     """Reason why a method cannot run; None if it can."""
-    if method.weights is None:
+    if not method.networks:
         return None
     key, path = f"rows.{method.name}.needs", setup.weights
     if path is None:
         return f"no weights are given: add the row to section `rows` of params.yaml, with their file as {key}"
     if not path.exists():
         return f"{path} is not there"
-    networks = method.weights.networks
-    if path.suffix == ".safetensors" and (network := load_checkpoint(path)[1]["network"]) not in networks:
-        return f"{path} holds a {network}, expected {' or '.join(networks)}: set {key} to such a file"
-    return None
+    network = weights_record(method, setup)["network"]
+    if network in method.networks:
+        return None
+    return f"{path} holds a {network}, expected {' or '.join(method.networks)}: set {key} to such a file"
 
 
 def weights_record(method: Method, setup: Setup) -> dict[str, str]:
     """File name, sha256 and network of the weights of a method that needs some; FileNotFoundError without a file."""
-    assert method.weights is not None, method.name
     path = weights_file(setup)
-    network = load_checkpoint(path)[1]["network"] if path.suffix == ".safetensors" else method.weights.networks[0]
+    network = load_checkpoint(path)[1]["network"] if path.suffix == ".safetensors" else method.networks[0]
     return {"file": path.name, "sha256": sha256(path), "network": network}
-
-
-def clamped(prediction: Prediction) -> Prediction:
-    """Prediction with DoLP clamped to [0, 1] and DoLP, AoLP and log variance in float32."""
-    aolp, log_variance = (None if x is None else x.float() for x in (prediction.aolp, prediction.log_variance))
-    return prediction._replace(dolp=prediction.dolp.float().clamp(0, 1), aolp=aolp, log_variance=log_variance)
 
 
 def each_map(prediction: Prediction, change: Callable[[Tensor], Tensor]) -> Prediction:
     """Apply `change` to every map of a prediction."""
     return Prediction(*(None if field is None else change(field) for field in prediction))  # type: ignore[arg-type]
+
+
+def joined(predictions: Sequence[Prediction], join: Callable[..., Tensor] = torch.cat) -> Prediction:
+    """Join the maps of several predictions, along their first axis or by `join`."""
+    fields = zip(*predictions, strict=True)
+    return Prediction(*(None if maps[0] is None else join(maps) for maps in fields))  # type: ignore[arg-type]

@@ -1,16 +1,12 @@
 """Run a method over windows of any length, whether they overlap or not.
 
-Networks are trained on consecutive windows, 1/30 s long in the paper; their state summarises all earlier windows.
-
 For DoLP at a higher rate, windows overlap. Passing the state from each to the next would count most events many times.
 A window therefore starts from the newest state whose window ended no later than this window starts (`advance`). If
 windows of length n S start every S, each continues the window n steps earlier, as if n cameras ran with shifted
-windows, and every event counts exactly once in each of these n series. If the step does not divide the length, events
-in the gap before a window are missed.
+windows. If the step does not divide the length, events in the gap before a window are missed.
 
 The sums, recurrent layers and gains of a network fit the window length of its training (`of_any_length`). Shorter
-windows are joined with earlier ones up to about that length, and longer windows are cut into parts of about that
-length. The method still returns one frame for each window it is given.
+windows are joined with earlier ones up to about that length, and longer windows are cut into parts of that length.
 """
 
 import itertools
@@ -21,7 +17,7 @@ import torch
 
 from polarnet.events.stream import Events, concatenate, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.method import Recoverer, State, each_map
+from polarnet.methods.method import Recoverer, State, each_map, joined
 from polarnet.stokes import Prediction
 
 STATES_PER_WINDOW = 64
@@ -88,13 +84,12 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
         for window in windows:
             parts, recent = _parts(window, trained_us), _recent(state.windows, window, trained_us)
             if len(parts) == 1:
-                parts = [_joined(recent)]
+                channels = [concatenate(of_one) for of_one in zip(*(one.channels for one in recent), strict=True)]
+                parts = [EventWindow(channels, recent[0].start_us, window.stop_us)]
             history, prediction = advance(recoverer, state.history, parts)
             state = Recent(history, recent)
             frames.append(each_map(prediction, lambda field: field[-1]))
-        fields = zip(*frames, strict=True)
-        maps = [None if field[0] is None else torch.stack(field) for field in fields]
-        return state, Prediction(*maps)  # type: ignore[arg-type]
+        return state, joined(frames, torch.stack)
 
     return recoverer._replace(start=start, predict=predict)
 
@@ -108,11 +103,6 @@ def _recent(before: Sequence[EventWindow], window: EventWindow, trained_us: int)
             break
         last.insert(0, earlier)
     return tuple(last)
-
-
-def _joined(windows: Sequence[EventWindow]) -> EventWindow:
-    channels = [concatenate(parts) for parts in zip(*(window.channels for window in windows), strict=True)]
-    return EventWindow(channels, windows[0].start_us, windows[-1].stop_us)
 
 
 def _parts(window: EventWindow, trained_us: int) -> list[EventWindow]:

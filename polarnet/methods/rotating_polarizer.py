@@ -126,37 +126,28 @@ def _fit(
 ) -> Float64[np.ndarray, "3 count"]:
     """b / a, c / a and the number of events of each pixel, from events in time order."""
     level = np.zeros(count)  # sum of a pixel's steps since its first event
-    sums = np.zeros((count, 8))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin); y w = 1 / y
+    sums = np.zeros((count, 9))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin, 1); y w = 1 / y
     fitted = np.zeros((3, count))
-    ones = np.zeros(count)
     for k in range(len(pixel)):
         i, c, s = pixel[k], cos[k], sin[k]
         if fitted[2, i] > 0:
             level[i] += step[k]
         fitted[2, i] += 1
-        inverse = math.exp(-level[i])
-        weight = inverse * inverse
-        ones[i] += inverse
-        row = sums[i]
-        row[0] += weight
-        row[1] += weight * c
-        row[2] += weight * s
-        row[3] += weight * c * c
-        row[4] += weight * c * s
-        row[5] += weight * s * s
-        row[6] += inverse * c
-        row[7] += inverse * s
+        y = math.exp(-level[i])
+        w = y * y
+        for j, term in enumerate((w, w * c, w * s, w * c * c, w * c * s, w * s * s, y * c, y * s, y)):
+            sums[i, j] += term
     for i in range(count):
         if fitted[2, i] < MIN_EVENTS:
             continue
-        w, wc, ws, cc, cs, ss, yc, ys = sums[i]
+        w, wc, ws, cc, cs, ss, yc, ys, y = sums[i]
         cc, ss = cc + ridge * w, ss + ridge * w
         # eliminate a, then solve the two equations for b and c
         cc, cs, ss = cc - wc * wc / w, cs - wc * ws / w, ss - ws * ws / w
-        yc, ys = yc - wc * ones[i] / w, ys - ws * ones[i] / w
+        yc, ys = yc - wc * y / w, ys - ws * y / w
         determinant = max(cc * ss - cs * cs, PIVOT_MIN * cc * ss)
         b, c = (ss * yc - cs * ys) / determinant, (cc * ys - cs * yc) / determinant
-        a = (ones[i] - wc * b - ws * c) / w
+        a = (y - wc * b - ws * c) / w
         fitted[0, i], fitted[1, i] = b / a, c / a
     return fitted
 

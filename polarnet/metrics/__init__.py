@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
-    from polarnet.metrics.scores import frame_scores as frame_scores
-    from polarnet.metrics.scores import score as score
+    from polarnet.metrics.similarity import frame_scores as frame_scores
     from polarnet.metrics.similarity import mse as mse
     from polarnet.metrics.similarity import psnr as psnr
+    from polarnet.metrics.similarity import score as score
     from polarnet.metrics.similarity import ssim as ssim
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

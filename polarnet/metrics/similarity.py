@@ -12,6 +12,7 @@ The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpi
 
 import functools
 import math
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +28,7 @@ from polarnet.runtime.arrays import (
     check_shape,
     mask_of,
 )
+from polarnet.stokes import Prediction
 
 Valid = Bool[Array, "*b h w"] | None
 
@@ -104,13 +106,11 @@ def correlation(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Val
     (a, b), valid = _checked(valid, a=a, b=b)
     dtype = torch.promote_types(a.dtype, b.dtype)
     a, b = _centred(a.double(), valid), _centred(b.double(), valid)
-    variance = mean_where(a.square(), valid) * mean_where(b.square(), valid)
-    varies = (_deviation(a, valid) > MIN_DEVIATION) & (_deviation(b, valid) > MIN_DEVIATION)
-    covariance = mean_where(a * b, valid)
-    constant = torch.zeros_like(covariance)
-    if valid is not None:
-        constant[~valid.any(-1).any(-1)] = torch.nan
-    return torch.where(varies, covariance / torch.where(varies, variance, 1.0).sqrt(), constant).to(dtype)
+    covariance, variance_a, variance_b = (mean_where(x, valid) for x in (a * b, a.square(), b.square()))
+    varies = (variance_a.sqrt() > MIN_DEVIATION) & (variance_b.sqrt() > MIN_DEVIATION)
+    variance = torch.where(varies, variance_a * variance_b, 1.0)
+    constant = 0.0 if valid is None else torch.where(valid.any(-1).any(-1), 0.0, torch.nan)
+    return torch.where(varies, covariance / variance.sqrt(), constant).to(dtype)
 
 
 def gradient_agreement(
@@ -120,9 +120,8 @@ def gradient_agreement(
 
     The range is [-1, 1]: 1 for the same gradients, 0 where either frame has none, -1 for opposite gradients. An edge of
     half the true height lowers the score, unlike in `correlation`. The gradients are Sobel's at the interior pixels
-    (with a mask: those whose eight neighbours are valid as well). The ratio is that of gradient similarity (Liu, Lin &
-    Narwaria, IEEE TIP 2012), but of vectors, and pooled over the frame before the division. ValueError for a frame
-    smaller than 3 pixels.
+    (with a mask: those whose eight neighbours are valid as well), pooled over the frame before the division (after Liu,
+    Lin & Narwaria, IEEE TIP 2012). ValueError for a frame smaller than 3 pixels.
     """
     (a, b), valid = _checked(valid, a=a, b=b)
     if min(a.shape[-2:]) < len(SOBEL_SLOPE):
@@ -130,14 +129,13 @@ def gradient_agreement(
     dtype = torch.promote_types(a.dtype, b.dtype)
     interior = None if valid is None else valid.unfold(-2, 3, 1).unfold(-2, 3, 1).flatten(-2).all(-1)
     (a_x, a_y), (b_x, b_y) = (_sobel(x.double()) for x in (a, b))
-
-    def total(values: Tensor) -> Tensor:
-        return (values if interior is None else torch.where(interior, values, 0.0)).sum(dim=(-2, -1))
-
-    common, energy = total(a_x * b_x + a_y * b_y), [total(x.square() + y.square()) for x, y in ((a_x, a_y), (b_x, b_y))]
+    products = torch.stack([a_x * b_x + a_y * b_y, a_x.square() + a_y.square(), b_x.square() + b_y.square()])
+    if interior is not None:
+        products = torch.where(interior, products, 0.0)
+    common, energy_a, energy_b = products.sum(dim=(-2, -1))
     floor = MIN_DEVIATION**2 * a_x.shape[-2] * a_x.shape[-1]
-    varies = (energy[0] > floor) & (energy[1] > floor)
-    return torch.where(varies, 2 * common / torch.where(varies, energy[0] + energy[1], 1.0), 0.0).to(dtype)
+    varies = (energy_a > floor) & (energy_b > floor)
+    return torch.where(varies, 2 * common / torch.where(varies, energy_a + energy_b, 1.0), 0.0).to(dtype)
 
 
 def aolp_error_deg(
@@ -186,6 +184,54 @@ def ssim(a: Float[Array, "*b h w"], b: Float[Array, "*b h w"], valid: Valid = No
         return mean_where(luminance * structure, valid)
 
 
+def frame_scores(
+    prediction: Prediction,
+    dolp: Float[Tensor, "n h w"],
+    aolp: Float[Tensor, "n h w"],
+    valid: Bool[Tensor, "n h w"] | None = None,
+) -> Mapping[str, Float[Tensor, " n"]]:
+    """Scores of each frame as in the benchmark: mse, psnr, ssim, corr and, if an angle is predicted, aolp_deg.
+
+    >>> import torch
+    >>> from polarnet.metrics import frame_scores
+    >>> from polarnet.stokes import Prediction
+    >>> truth = torch.full((2, 16, 16), 0.5)
+    >>> frame_scores(Prediction(truth), truth, truth)["mse"]
+    tensor([0., 0.])
+    """
+    scores = {
+        "mse": mse(prediction.dolp, dolp, valid),
+        "psnr": psnr(prediction.dolp, dolp, valid),
+        "ssim": ssim(prediction.dolp, dolp, valid),
+        "corr": correlation(prediction.dolp, dolp, valid),
+    }
+    if prediction.aolp is not None:
+        scores["aolp_deg"] = aolp_error_deg(prediction.aolp, aolp, dolp, valid)
+    return scores
+
+
+def score(
+    prediction: Prediction,
+    dolp: Float[Tensor, "n h w"],
+    aolp: Float[Tensor, "n h w"],
+    warmup_frames: int = 0,
+    valid: Bool[Tensor, "n h w"] | None = None,
+) -> dict[str, float]:
+    """Means of `frame_scores` over the frames after the first `warmup_frames`; ValueError if none is left.
+
+    >>> import torch
+    >>> from polarnet.metrics import score
+    >>> from polarnet.stokes import Prediction
+    >>> truth = torch.full((3, 16, 16), 0.5)
+    >>> score(Prediction(truth + 0.1), truth, truth)["mse"]
+    0.010...
+    """
+    if not 0 <= warmup_frames < len(dolp):
+        raise ValueError(f"warmup_frames: expected 0 to {len(dolp) - 1}, got {warmup_frames}")
+    scores = frame_scores(prediction, dolp, aolp, valid)
+    return {name: float(values[warmup_frames:].mean()) for name, values in scores.items()}
+
+
 def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:
     """Frames, checked to be floating-point and of one shape, and their mask, as tensors."""
     tensors = {name: as_tensor(name, values) for name, values in frames.items()}
@@ -206,10 +252,6 @@ def _centred(frames: Tensor, valid: Tensor | None) -> Tensor:
     return frames - mean_where(frames, valid)[..., None, None]
 
 
-def _deviation(centred: Tensor, valid: Tensor | None) -> Tensor:
-    return mean_where(centred.detach().square(), valid).sqrt()
-
-
 def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Float[Tensor, "*b i j"]]:
     """Gradients (along rows, along columns) per pixel, at the interior pixels."""
 
@@ -226,8 +268,7 @@ def _sobel(frames: Float[Tensor, "*b h w"]) -> tuple[Float[Tensor, "*b i j"], Fl
 def _gaussian_means(frames: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b h w"]:
     # On a CPU two matrix products are 8 (forward) to 18 times (with backward) faster than two convolutions.
     h, w = frames.shape[-2:]
-    rows = _gaussian_matrix(h, frames.dtype, frames.device)
-    columns = _gaussian_matrix(w, frames.dtype, frames.device)
+    rows, columns = (_gaussian_matrix(size, frames.dtype, frames.device) for size in (h, w))
     return rows @ (frames @ columns.T)
 
 

@@ -62,9 +62,8 @@ def export_network(
 ) -> None:
     """Write the result of `load_network` to `path` (.onnx) for one image size, once it passes `check_program`.
 
-    The file contains the weights, and the same network gives the same bytes. Raises ValueError or FileNotFoundError if
-    `path` cannot be written, and RuntimeError if packages are missing or the check fails. After an error an existing
-    file is unchanged and no new file is left.
+    The file contains the weights, and the same network gives the same bytes. ValueError or FileNotFoundError if `path`
+    cannot be written, RuntimeError if packages are missing or the check fails; an existing file is then unchanged.
     """
     for name in ("onnx", "onnxruntime", "onnxscript"):
         if importlib.util.find_spec(name) is None:
@@ -127,6 +126,7 @@ def _traced(
         # Run the network at this size before tracing: it caches masks, and masks cached during tracing hold no values.
         prediction, state = network(events)
     encode = REPRESENTATIONS[metadata["representation"]]
+    names = [f"state_{number}" for number in range(len(state))]
     description = {
         "format": FORMAT,
         "network": metadata["network"],
@@ -141,8 +141,8 @@ def _traced(
         },
         "outputs": {name: MEANINGS[name] for name in outputs_by_name(prediction, [])},
         "state": [
-            {"input": f"state_{number}", "output": f"new_state_{number}", "shape": list(tensor.shape), "start": 0.0}
-            for number, tensor in enumerate(state)
+            {"input": name, "output": f"new_{name}", "shape": list(tensor.shape), "start": 0.0}
+            for name, tensor in zip(names, state, strict=True)
         ],
         "checkpoint": dict(metadata),
     }
@@ -154,7 +154,7 @@ def _traced(
             OneWindow(network).eval(),
             (events, *(torch.zeros_like(tensor) for tensor in state)),
             dynamo=True,
-            input_names=["events", *(f"state_{number}" for number in range(len(state)))],
+            input_names=["events", *names],
             output_names=list(outputs_by_name(prediction, state)),
             opset_version=OPSET,
             verbose=False,

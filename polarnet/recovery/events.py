@@ -11,7 +11,7 @@ from torch import Tensor
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow, windows_of
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.methods.method import State, each_map
+from polarnet.methods.method import State, each_map, joined
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
@@ -72,5 +72,4 @@ def recover(
     for first in range(0, len(windows), size):
         state, prediction = recoverer.step(state, windows[first : first + size])
         parts.append(each_map(prediction, Tensor.cpu))
-    joined = [None if fields[0] is None else torch.cat(fields) for fields in zip(*parts, strict=True)]
-    return Recovery(t_us[1:], Prediction(*joined))  # type: ignore[arg-type]
+    return Recovery(t_us[1:], joined(parts))

@@ -17,7 +17,7 @@ from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, Event
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
-from polarnet.metrics.scores import frame_scores
+from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.live import Piece
 from polarnet.recovery.writer import RecoveryWriter
@@ -97,12 +97,12 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
             raise ValueError(f"--{option} is for the DoLP network, {method.name} does not use it")
         if value is not None:
             setup = replace(setup, config=replace(setup.config, **{option: value}))
-    if method.weights is None:
+    if not method.networks:
         if chosen.weights is not None:
             raise ValueError(f"--weights: {method.name} has no weights; leave it out")
         turns = f", {setup.rotation.rate_hz:g} turns/s" if setup.rotation else ""
         return method.open(setup), f"{method.name}{turns}"
-    weights = chosen.weights or (shipped_weights() if method.weights.shipped else setup.weights)
+    weights = chosen.weights or (shipped_weights() if method.shipped else setup.weights)
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")
@@ -238,8 +238,8 @@ class TruthScores:
         if not scores:
             raise ValueError(
                 f"--truth: expected more than {skipped} frames with a true frame at the end of their window, got "
-                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window and --rate, or "
-                f"record for longer"
+                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window, or record "
+                f"for longer"
             )
         means = {name: math.fsum(one[name] for one in scores) / len(scores) for name in scores[0]}
         words = ", ".join(SCORES[name].format(value) for name, value in means.items())

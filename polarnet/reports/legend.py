@@ -107,7 +107,7 @@ def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -
     entries = [
         (legend.label(row), _about(row, weights.get(row)))
         for row in dict.fromkeys(method.removesuffix(GAIN) for method in rows)
-        if row in weights or (row in ROWS and ROWS[row].about and (row not in METHODS or METHODS[row].weights is None))
+        if row in weights or (row in ROWS and ROWS[row].about and (row not in METHODS or not METHODS[row].networks))
     ]
     return entries + ([("gains solved", GAINS)] if any(method.endswith(GAIN) for method in rows) else [])
 

@@ -54,7 +54,6 @@ COSTS = {
     "ms_per_window": COLUMNS["ms_per_window"],
     "gflop": Column("GFLOP / window", 2, "low", False, " GFLOP"),
     "params": Column("parameters", 0, "low", False, ""),
-    "peak_mib": Column("peak MiB", 1, "low", False, " MiB"),
 }
 """Costs of a method on the machine of the run."""
 

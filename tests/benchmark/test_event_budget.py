@@ -17,11 +17,6 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 
-@pytest.fixture
-def recoverer(context):
-    return opened(METHODS["ours"], context)
-
-
 def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):
     t_us = sequence.t_us
     per_pixel = events_per_pixel(sequence.events, t_us)
@@ -30,7 +25,8 @@ def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):
     assert per_pixel[2].item() == pytest.approx(half)
 
 
-def test_a_growing_window_holds_all_events_so_far_and_the_last_window_as_many_as_asked(sequence, recoverer):
+def test_a_growing_window_holds_all_events_so_far_and_the_last_window_as_many_as_asked(sequence, context):
+    recoverer = opened(METHODS["ours"], context)
     growing = [growing_window(sequence.events, t_us) for t_us in (1000, 2000)]
     for window, stop_us in zip(growing, (1000, 2000), strict=True):
         assert (window.start_us, window.stop_us) == (0, stop_us)
@@ -54,13 +50,8 @@ def test_every_frame_falls_into_one_bin_of_events_per_pixel(make_sequence, conte
         assert entry["skill"] == pytest.approx(0, abs=1e-6)
 
 
-@pytest.fixture
-def stores(simulated):
-    return SceneStore.open(simulated.scenes), EventStore.open(simulated.events)
-
-
-def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(stores, context):
-    scenes, events = stores
+def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(simulated, context):
+    scenes, events = SceneStore.open(simulated.scenes), EventStore.open(simulated.events)
     assert scenes.duration_us("a-0") == 200_000
     table = by_window_length(scenes, events, ["a-0"], [20_000, 40_000], 0, ["zeros", "oracle_mean"], context)
     short, long = table["zeros"]
@@ -73,10 +64,9 @@ def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(stores, co
         by_window_length(scenes, events, ["a-0"], [150_000], 160_000, ["zeros"], context)
 
 
-def test_truth_at_any_time_lies_between_that_of_the_frames(stores, simulated):
-    frames = FrameStore.open(simulated.frames)
+def test_truth_at_any_time_lies_between_that_of_the_frames(simulated):
+    scenes, frames = SceneStore.open(simulated.scenes), FrameStore.open(simulated.frames)
     t_us = frames.t_us("a-0")
-    result = sequence_at(stores[0], "a-0", stores[1].read("a-0"), t_us)
-    torch.testing.assert_close(result.dolp, frames.dolp("a-0")[1:], atol=1e-5, rtol=0)
-    finer = sequence_at(stores[0], "a-0", stores[1].read("a-0"), torch.arange(0, int(t_us[-1]) + 1, 5000))
+    torch.testing.assert_close(sequence_at(scenes, "a-0", [], t_us).dolp, frames.dolp("a-0")[1:], atol=1e-5, rtol=0)
+    finer = sequence_at(scenes, "a-0", [], torch.arange(0, int(t_us[-1]) + 1, 5000))
     assert len(finer.dolp) == int(t_us[-1]) // 5000

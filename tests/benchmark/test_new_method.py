@@ -4,12 +4,9 @@ import dataclasses
 import re
 
 import pytest
-import torch
 
 from polarnet import methods
-from polarnet.analysis.event_budget import last_window, recovered_alone, since_start
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import opened
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.config.pipeline import context_of
@@ -67,12 +64,3 @@ def test_recover_runs_it(activity, sequence, make_setup):
     frames = list(frames_of(source, WindowRule(1000, None, None), activity.open(make_setup("activity"))))
     assert [frame.window.stop_us for frame in frames] == [1000, 2000, 3000, 4000]
     assert frames[-1].prediction.dolp.sum().item() == pytest.approx(4 * 300 * EVENT)
-
-
-def test_the_event_budget_runs_it(activity, with_activity, sequence):
-    table = since_start([sequence], ["activity"], with_activity)
-    assert sum(entry["frames"] for entry in table["activity"]) == 4
-    recoverer = opened(activity, with_activity)
-    windows = [last_window(sequence.events, 50, t_us) for t_us in (2000, 2100)]
-    alone = recovered_alone(windows, recoverer).sum(dim=(1, 2))
-    torch.testing.assert_close(alone, torch.tensor([200 * EVENT, 200 * EVENT]))

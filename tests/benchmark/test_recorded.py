@@ -11,7 +11,7 @@ from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, merge
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
@@ -105,15 +105,13 @@ def test_events_and_frames_on_one_clock_agree_and_a_shift_is_found(recording):
     assert "ms late against the events" in note
 
 
-def test_events_that_have_nothing_to_do_with_the_frames_are_reported(recording, make_random_events):
+def test_events_that_have_nothing_to_do_with_the_frames_are_reported_and_frames_far_from_them_refused(
+    recording, make_random_events, tmp_path
+):
     truth = read_truth(recording, MOSAIC)
     noise = make_random_events(0, 20_000, int(truth.t_us[-1]), 80, 112)
     (note,) = clock_notes(truth.t_us, frame_lag(noise, truth))
     assert "whether they are on one clock is unknown" in note
-
-
-def test_frames_far_from_the_events_are_refused(recording, tmp_path):
-    truth = read_truth(recording, MOSAIC)
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
     path = tmp_path / "far.h5"
     write_e2p(path, read_recording(recording).events, truth.t_us + 10_000_000, levels, None)
@@ -135,8 +133,6 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     t = torch.arange(int(events.t[0]), int(events.t[-1]), 200)
     places = torch.full_like(t, 20).short()
     hot = Events(t, places, places, torch.ones_like(t).to(torch.int8), 80, 112)
-    from polarnet.events.stream import merge
-
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
     (tmp_path / "in").mkdir()
     write_e2p(tmp_path / "in" / "hot.h5", merge([events, hot]), truth.t_us, levels, None)

@@ -49,16 +49,12 @@ def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder
     assert set(left.costs) == {"zeros", "ours"}
 
 
-def test_a_row_or_a_set_that_was_not_run_is_named(benchmark, tmp_path):
+def test_a_row_or_set_that_was_not_run_and_rows_of_different_sequences_are_refused(benchmark, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"row cf was not run; run `dvc repro`"):
         read_record(tmp_path / "cf")
     folders = written(tmp_path, benchmark)
     with pytest.raises(FileNotFoundError, match="row zeros has not run on set measured"):
         read_rows(folders, "measured")
-
-
-def test_rows_of_different_sequences_make_no_table(benchmark, tmp_path):
-    folders = written(tmp_path, benchmark)
     file = folders["cf"] / "simulated" / "results.json"
     results = json.loads(file.read_text())
     results["frames"] = [score for score in results["frames"] if score[1] != "b1"]

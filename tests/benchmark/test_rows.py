@@ -1,4 +1,5 @@
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -6,8 +7,9 @@ import torch
 from polarnet.benchmark.rows import available, metadata_used, predictions_of, weights_used
 from polarnet.events.stream import Events
 from polarnet.methods import ROWS
-from polarnet.metrics.references import oracle_mean
+from polarnet.metrics.references import REFERENCES, oracle_mean
 from polarnet.metrics.similarity import mse
+from polarnet.stokes import Prediction
 
 
 def dolp_of(row, sequence, context):
@@ -28,19 +30,20 @@ def test_only_the_oracle_looks_at_the_truth(row, sequence, context):
     assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, blind, context))
 
 
-@pytest.mark.parametrize("row", ["zeros", "train_mean", "oracle_mean"])
-def test_references_look_at_no_event(row, sequence, context):
+@pytest.mark.parametrize("row", ["zeros", "train_mean", "oracle_mean", "rotating_polarizer"])
+def test_references_look_at_no_event_and_a_rotating_polarizer_has_a_camera_of_its_own(row, sequence, context):
     still = dataclasses.replace(sequence, events=[Events.empty(18, 20)] * 4)
     assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, still, context))
+    if row == "rotating_polarizer":
+        without = dataclasses.replace(sequence, rotating=None)
+        with pytest.raises(ValueError, match="a: expected events of a camera behind a rotating polarizer, there are"):
+            dolp_of(row, without, context)
 
 
-@pytest.mark.parametrize("constant", [0.0, 0.25, 0.45, 0.5, 0.55, 1.0])
-def test_the_oracle_mean_beats_every_constant_on_every_frame(constant, sequence, context):
+def test_the_oracle_mean_beats_every_constant_on_every_frame_and_knows_the_valid_pixels_alone(sequence, context):
     oracle = dolp_of("oracle_mean", sequence, context)
-    assert (mse(oracle, sequence.dolp) <= mse(torch.full_like(oracle, constant), sequence.dolp)).all()
-
-
-def test_the_oracle_knows_the_mean_of_the_valid_pixels_alone():
+    for constant in (0.0, 0.25, 0.45, 0.5, 0.55, 1.0):
+        assert (mse(oracle, sequence.dolp) <= mse(torch.full_like(oracle, constant), sequence.dolp)).all()
     truth = torch.rand(3, 4, 5)
     valid = truth < 0.6
     valid[1] = False
@@ -62,27 +65,16 @@ def test_a_row_that_cannot_run_is_left_out_with_the_reason(make_context, tmp_pat
     assert available(list(ROWS), make_context()) == (list(ROWS), {})
 
 
-def test_weights_that_are_not_there_are_missed_by_their_methods_alone(sequence, make_context, tmp_path):
-    context = make_context(ours={"weights": tmp_path / "none.safetensors"})
-    predictions_of(["cf"], sequence, context)
-    with pytest.raises(FileNotFoundError, match=r"none.safetensors is missing"):
-        predictions_of(["ours"], sequence, context)
+def test_a_predicted_value_that_is_not_a_number_is_named(sequence, context, monkeypatch):
+    sequence.dolp[2, 3, 3] = math.nan
+    damaged = dataclasses.replace(REFERENCES["zeros"], predict=lambda truth, valid, train_mean: Prediction(truth))
+    monkeypatch.setitem(REFERENCES, "zeros", damaged)
+    with pytest.raises(ValueError, match="zeros on a, window 2: it predicted values that are not numbers"):
+        predictions_of(["zeros"], sequence, context)
 
 
-def test_the_weights_behind_a_table_are_named_once_a_section(context):
+def test_weights_are_named_once_a_section_and_checkpoints_of_polarnet_say_what_they_are(context):
     used = weights_used(["zeros", "cf", "e2v", "e2v+gain"], context)
     assert {section: one["file"] for section, one in used.items()} == {"e2v": "firenet.safetensors"}
-
-
-def test_checkpoints_of_polarnet_say_what_they_are_and_files_of_other_authors_say_nothing(context):
     metadata = metadata_used(["zeros", "cf", "e2v", "e2v+gain", "firenet_published", "ours"], context)
     assert {row: one["network"] for row, one in metadata.items()} == {"e2v": "firenet", "ours": "paper"}
-
-
-def test_the_row_of_a_rotating_polarizer_sees_its_own_camera_alone(sequence, context):
-    silent = dataclasses.replace(sequence, events=[Events.empty(18, 20)] * 4)
-    row = "rotating_polarizer"
-    assert torch.equal(dolp_of(row, sequence, context), dolp_of(row, silent, context))
-    without = dataclasses.replace(sequence, rotating=None)
-    with pytest.raises(ValueError, match="a: expected events of a camera behind a rotating polarizer, there are none"):
-        dolp_of(row, without, context)

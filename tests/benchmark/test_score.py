@@ -1,18 +1,20 @@
-import csv
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.stats import wilcoxon
 
 from polarnet.benchmark.score import (
     METRICS,
     BenchmarkConfig,
     FrameScore,
+    compared,
+    paired_comparisons,
     scene_means,
     score_sequence,
     summary,
-    write_frames,
 )
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
@@ -26,12 +28,13 @@ def row(scene, value, method="m", sequence=None, window=0, lpips=None, aolp_deg=
     return FrameScore(method, scene, sequence or scene, window, 0, **scores)
 
 
-def config(**changes):
-    settings = BenchmarkConfig(["zeros"], ["simulated"], 1, "fp32", False, "alex", 10, 1)
-    return dataclasses.replace(settings, **changes)
+SETTINGS = {
+    "methods": ["zeros"], "sets": ["simulated"], "warmup_windows": 1, "precision": "fp32", "lpips": False,
+    "lpips_backbone": "alex", "bootstrap_samples": 10, "panel_scenes": 1,
+}  # fmt: skip
 
 
-def test_a_constant_offset_scores_its_square_as_level(sequence):
+def test_a_constant_offset_scores_its_square_as_level_in_windows_after_the_warm_up(sequence):
     sequence = dataclasses.replace(sequence, dolp=0.5 * sequence.dolp)
     rows = score_sequence(sequence, {"m": Prediction(sequence.dolp + 0.1)}, 0, None, CPU)
     assert [r.window for r in rows] == [0, 1, 2, 3]
@@ -40,28 +43,21 @@ def test_a_constant_offset_scores_its_square_as_level(sequence):
         scores = (r.mse, r.psnr, r.level_mse, r.pattern_mse, r.corr)
         assert scores == pytest.approx((0.01, 20, 0.01, 0, 1), abs=1e-6)
         assert r.lpips is None
-
-
-def test_warm_up_windows_count_for_no_method(sequence):
     spoilt = sequence.dolp.clone()
-    spoilt[:2] = float("nan")
+    spoilt[:2] = float("nan")  # windows of the warm-up count for no method
     rows = score_sequence(sequence, {"a": Prediction(spoilt), "b": Prediction(sequence.dolp)}, 2, None, CPU)
     assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_frame_that_is_not_a_number_is_named_not_dropped(sequence, bad):
-    spoilt = sequence.dolp.clone()
-    spoilt[3, 5, 5] = bad
-    with pytest.raises(ValueError, match=r"m on a, window 3: mse is (nan|inf)"):
-        score_sequence(sequence, {"m": Prediction(spoilt)}, 0, None, CPU)
 
 
 def test_frames_that_cannot_be_scored_are_refused(sequence):
     with pytest.raises(ValueError, match=r"4 windows and the first 4 are warm-up.*lower benchmark.warmup_windows"):
         score_sequence(sequence, {"m": Prediction(sequence.dolp)}, 4, None, CPU)
-    with pytest.raises(ValueError, match=r"m on a: expected frames of \(4, 18, 20\), got \(3, 18, 20\)"):
-        score_sequence(sequence, {"m": Prediction(sequence.dolp[:3])}, 0, None, CPU)
+    valid = torch.ones_like(sequence.dolp, dtype=torch.bool)
+    valid[2] = False
+    masked = dataclasses.replace(sequence, valid=valid)
+    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
+        score_sequence(masked, {"m": Prediction(sequence.dolp)}, 1, None, CPU)
+    assert len(score_sequence(masked, {"m": Prediction(sequence.dolp)}, 3, None, CPU)) == 1
 
 
 def test_lpips_sees_the_truth_once_for_all_methods_and_a_constant_once(make_sequence, monkeypatch):
@@ -90,17 +86,14 @@ def test_scenes_weigh_alike_however_many_sequences_show_them():
 
 def test_the_interval_is_the_same_every_time_and_shrinks_to_a_single_scene():
     rows = [row(f"s{i}", float(i)) for i in range(10)]
-    first, again, other = summary(rows, 500, 1), summary(rows, 500, 1), summary(rows, 500, 2)
+    first, again, other = summary(rows, 500, 1), summary(rows[::-1], 500, 1), summary(rows, 500, 2)
     assert first == again
     assert first["m"]["mse_ci"] != other["m"]["mse_ci"]
     low, high = first["m"]["mse_ci"]
     assert 2 < low < 4.5 < high < 7  # +- 1.96 * 2.87 / sqrt(10) = 1.78
     assert summary(rows[3:4], 500, 1)["m"]["mse_ci"] == [3.0, 3.0]
-
-
-def test_the_order_of_rows_changes_nothing():
-    rows = [row(f"s{i}", math.sqrt(i), window=k) for i in range(5) for k in range(3)]
-    assert summary(rows, 50, 0) == summary(rows[::-1], 50, 0)
+    assert first["m"]["lpips"] is None
+    assert "lpips_ci" not in first["m"]
 
 
 def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
@@ -126,44 +119,16 @@ def test_the_angle_is_scored_where_there_is_one(sequence):
     assert "without" not in scene_means(rows, "aolp_deg")
 
 
-def test_lpips_that_was_not_computed_is_null_without_an_interval():
-    table = summary([row("x", 1.0), row("y", 2.0)], 10, 0)["m"]
-    assert table["lpips"] is None
-    assert "lpips_ci" not in table
-    assert summary([row("x", 1.0, lpips=0.5)], 10, 0)["m"]["lpips"] == 0.5
-
-
-def test_a_method_that_lacks_a_scene_or_the_angle_of_some_frames_is_named():
-    with pytest.raises(ValueError, match=r"b has no score for \['y'\]"):
-        summary([row("x", 1.0, "a"), row("y", 1.0, "a"), row("x", 1.0, "b")], 10, 0)
-    with pytest.raises(ValueError, match="m has no aolp_deg for 1 of its frames"):
-        scene_means([row("x", 1.0, aolp_deg=3.0), row("y", 1.0)], "aolp_deg")
-
-
-def test_frames_are_written_one_a_line_with_empty_cells_for_what_is_not_known(tmp_path):
-    write_frames(tmp_path / "frames.csv", [row("x", 0.1), row("y", 1 / 3, lpips=0.25)])
-    with (tmp_path / "frames.csv").open() as file:
-        first, second = csv.DictReader(file)
-    assert first["lpips"] == ""
-    assert float(second["mse"]) == 1 / 3
-    assert second["scene"] == "y"
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
-        ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
-        ({"methods": []}, "methods: expected at least one and none twice"),
-        ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-        ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
-        ({"warmup_windows": -1}, "warmup_windows: expected >= 0, got -1"),
-        ({"precision": "fp16"}, "precision: expected one of fp32, bf16, got 'fp16'"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"methods": ["zeros", "magic"]}, r"methods\[1\]: expected one of zeros, train_mean, .*, got 'magic'"),
+    ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
+    ({"methods": []}, "methods: expected at least one and none twice"),
+    ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
+    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
+])  # fmt: skip
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        config(**change)
+        BenchmarkConfig(**{**SETTINGS, **change})
 
 
 def test_masked_pixels_count_in_no_score(make_sequence):
@@ -186,10 +151,34 @@ def test_masked_pixels_count_in_no_score(make_sequence):
     assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
 
 
-def test_a_frame_without_a_valid_pixel_is_not_left_out_silently(sequence):
-    valid = torch.ones_like(sequence.dolp, dtype=torch.bool)
-    valid[2] = False
-    masked = dataclasses.replace(sequence, valid=valid)
-    with pytest.raises(ValueError, match="window 2: no pixel is valid"):
-        score_sequence(masked, {"m": Prediction(sequence.dolp)}, 1, None, CPU)
-    assert len(score_sequence(masked, {"m": Prediction(sequence.dolp)}, 3, None, CPU)) == 1
+def test_winning_all_of_six_scenes_has_effect_1_and_the_smallest_p_there_is():
+    comparison = compared(np.arange(1.0, 7.0))
+    assert comparison == {"scenes": 6, "better": 6, "effect": 1.0, "p": pytest.approx(2 / 2**6)}
+
+
+def test_ranks_by_hand():
+    # |gains| rank 1, 2, 3, 4; the second smallest is a loss: (1 - 2 + 3 + 4) / 10
+    comparison = compared(np.array([0.1, -0.2, 0.3, 0.4]))
+    assert comparison["effect"] == pytest.approx(0.6)
+    assert comparison["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
+
+
+def test_lower_is_better_for_errors_and_higher_for_psnr():
+    rows = [row(f"s{i}", 1.0 + i, "ours") for i in range(4)] + [row(f"s{i}", 2.0 + 1.5 * i, "cf") for i in range(4)]
+    comparison = paired_comparisons(rows, "ours")["cf"]
+    assert comparison["mse"]["better"] == 4
+    assert comparison["psnr"]["better"] == 0
+    assert comparison["mse"]["median_difference"] == pytest.approx(-1.75)
+    assert comparison["psnr"]["effect"] == -1
+    assert "lpips" not in comparison
+    assert paired_comparisons(rows, "zeros") == {}
+
+
+def test_holm_corrects_for_the_number_of_rivals_and_never_falls():
+    gains = {"a": [1, 2, 3, 4, 5, 6], "b": [1, 2, 3, 4, 5, -6], "c": [-1, 2, -3, 4, -5, 6]}
+    rows = [row(f"s{i}", 10.0, "ours") for i in range(6)]
+    rows += [row(f"s{i}", 10.0 + gain, name) for name, values in gains.items() for i, gain in enumerate(values)]
+    by_rival = {rival: scores["mse"] for rival, scores in paired_comparisons(rows, "ours").items()}
+    assert by_rival["a"]["p_holm"] == pytest.approx(3 * by_rival["a"]["p"])
+    assert by_rival["b"]["p_holm"] == pytest.approx(2 * by_rival["b"]["p"])
+    assert by_rival["a"]["p_holm"] <= by_rival["b"]["p_holm"] <= by_rival["c"]["p_holm"] <= 1

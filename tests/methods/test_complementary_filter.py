@@ -56,26 +56,16 @@ def reconstruct_cf(channels, t_us, config):
     return reconstructed(np.expm1, channels, t_us, config)
 
 
-def reconstruct_highpass(channels, t_us, config):
-    return reconstructed(highpass_intensity, channels, t_us, config)
-
-
-def test_cf_of_a_hand_worked_event_list(hand_list):
-    images = reconstruct_cf([hand_list], times(500, 2000, 3000, 5000), cf_config())
-    # An event shows after its time: log intensity of (1, 2): 0 | 0.1 / 2 | (0.1 / 2 + 0.1) / 2 | (0.15 / 4 - 0.1) / 2;
-    # of (0, 0): 0 | 0 | 0 | -0.1 / 4
+def test_a_hand_worked_event_list(hand_list):
+    """An event shows after its time. The high-pass filter halves log intensity at each event once more."""
+    at = times(500, 2000, 3000, 5000)
     expected = np.zeros((4, 2, 3))
-    expected[:, 1, 2] = [0, 0.05, 0.075, -0.03125]
-    expected[:, 0, 0] = [0, 0, 0, -0.025]
+    expected[:, 0, 0] = [0, 0, 0, -0.1 / 4]
+    expected[:, 1, 2] = [0, 0.1 / 2, (0.1 / 2 + 0.1) / 2, (0.15 / 4 - 0.1) / 2]
+    images = reconstruct_cf([hand_list], at, cf_config())
     np.testing.assert_allclose(images[:, 0], (np.exp(expected) - 1 + 0.1) / 1.3, rtol=0, atol=1e-12)
-
-
-def test_highpass_of_a_hand_worked_event_list(hand_list):
-    images = reconstruct_highpass([hand_list], times(500, 2000, 3000, 5000), highpass_config())
-    # each event halves once more: (1, 2): 0 | 0.1 / 2 | (0.1 / 4 + 0.1) / 2 | (0.125 / 8 - 0.1) / 2
-    expected = np.zeros((4, 2, 3))
-    expected[:, 1, 2] = [0, 0.05, 0.0625, -0.0421875]
-    expected[:, 0, 0] = [0, 0, 0, -0.025]
+    expected[:, 1, 2] = [0, 0.1 / 2, (0.1 / 4 + 0.1) / 2, (0.125 / 8 - 0.1) / 2]
+    images = reconstructed(highpass_intensity, [hand_list], at, highpass_config())
     np.testing.assert_allclose(images[:, 0], (1.5 * np.exp(expected) - 1 + 0.5) / 2, rtol=0, atol=1e-12)
 
 
@@ -84,29 +74,10 @@ def test_without_a_cutoff_log_intensity_is_the_sum_of_the_steps(hand_list):
     assert images[0, 0, 1, 2].item() == pytest.approx((math.exp(0.4) - 0.9) / 1.3, abs=1e-12)
 
 
-def test_before_any_event_a_filter_shows_log_intensity_zero():
-    none = Events.empty(2, 3)
-    torch.testing.assert_close(
-        reconstruct_cf([none], times(0, 10), cf_config()), torch.full((2, 1, 2, 3), 0.1 / 1.3, dtype=torch.float64)
-    )
-    torch.testing.assert_close(
-        reconstruct_highpass([none], times(0, 10), highpass_config()),
-        torch.full((2, 1, 2, 3), 0.5, dtype=torch.float64),
-    )
-
-
 def test_intensities_outside_the_range_are_clipped():
-    bright = events_of(*((t, 0, 0, 1) for t in range(9)))
-    dark = events_of(*((t, 0, 0, -1) for t in range(9)))
-    assert reconstruct_cf([bright], times(9), cf_config(cutoff_hz=0.0))[0, 0, 0, 0] == 1  # exp(0.9) - 1 = 1.46 > 1.2
-    assert reconstruct_cf([dark], times(9), cf_config(cutoff_hz=0.0))[0, 0, 0, 0] == 0
-
-
-def test_twice_the_contrast_behind_one_polarizer_shows_as_twice_the_contrast():
-    three, six = (events_of(*((t, 0, 0, 1) for t in range(count))) for count in (3, 6))
-    images = reconstruct_cf([three, six], times(9), cf_config(cutoff_hz=0.0))[0, :, 0, 0]
-    intensity = 1.3 * images - 0.1
-    assert intensity.tolist() == pytest.approx([math.expm1(0.3), math.expm1(0.6)])
+    bright, dark = (events_of(*((t, 0, 0, p) for t in range(9))) for p in (1, -1))
+    images = reconstruct_cf([bright, dark], times(9), cf_config(cutoff_hz=0.0))
+    assert images[0, :, 0, 0].tolist() == [1, 0]  # exp(0.9) - 1 = 1.46 > 1.2
 
 
 def test_asking_for_more_output_times_changes_no_frame(hand_list):
@@ -132,11 +103,8 @@ def test_an_event_from_the_past_is_refused():
 
 
 @pytest.mark.parametrize("bad", [[0.5, 0.5], [1.0, 0.0], [0.0], [0.0, 0.5, 1.0]])
-def test_an_intensity_range_must_rise(bad):
+def test_an_intensity_range_must_rise_and_the_contrast_of_off_events_be_negative(bad):
     with pytest.raises(ValueError, match=r"intensity_range: expected \[low, high\] with low < high"):
         cf_config(intensity_range=bad)
-
-
-def test_contrasts_of_the_wrong_sign_are_refused():
     with pytest.raises(ValueError, match=r"contrast_off: expected <= 0, got 0.1"):
         cf_config(contrast_off=0.1)

@@ -73,7 +73,7 @@ def test_windows_at_once_give_what_they_give_one_by_one_and_a_step_changes_no_st
 
 
 def test_filters_come_first_then_reconstructions_then_networks_of_dolp():
-    kinds = [(method.weights is not None, not method.reconstructs) for method in METHODS.values()]
+    kinds = [(bool(method.networks), not method.reconstructs) for method in METHODS.values()]
     assert kinds == sorted(kinds)
     assert list(METHODS)[:4] == ["cf", "highpass", "cf+gain", "highpass+gain"]
     assert list(METHODS)[-4:] == ["e2p", "e2p_published", "paper", "ours"]
@@ -123,13 +123,6 @@ def test_reconstructions_treat_the_four_polarizers_alike(name, sequence, open_me
     torch.testing.assert_close(shifted, straight.roll(-1, dims=1))
 
 
-def test_every_reconstruction_has_a_row_with_its_gains_solved():
-    for name in RECONSTRUCTING:
-        solved = METHODS[f"{name}+gain"]
-        assert (solved.wraps, solved.section) == (METHODS[name], name)
-        assert solved.label == f"{METHODS[name].label}, gains solved"
-
-
 def reconstructing(intensities):
     """A method that reconstructs these, whatever it sees."""
 
@@ -144,6 +137,7 @@ def test_solved_gains_undo_what_a_method_left_unknown(sequence, make_setup):
     true = intensities_from_stokes(stokes_from_polarization(s0, dolp, aolp))
     method = reconstructing(true * torch.tensor([1.5, 0.7, 1.0, 0.8]).view(4, 1, 1))
     setup = make_setup("cf")
+    assert [METHODS[f"{name}+gain"].section for name in RECONSTRUCTING] == RECONSTRUCTING
     solved = recovered(with_gain(method).open(setup), sequence.windows)
     torch.testing.assert_close(solved.dolp, dolp, atol=1e-3, rtol=0)
     assert not torch.allclose(recovered(method.open(setup), sequence.windows).dolp, dolp, atol=0.1)
@@ -213,13 +207,6 @@ def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, 
         torch.testing.assert_close(given.dolp, stokes_unet.unroll(inputs)[0].dolp[:, 0].clamp(0, 1))
 
 
-def test_thresholds_need_a_network_that_has_a_use_for_them(stokes_unet):
-    with pytest.raises(ValueError, match="expected network polarnet, got paper; leave thresholds out"):
-        dolp_recoverer(torch.nn.Identity(), COUNTS | {"network": "paper"}, thresholds=(0.1, 0.1))
-    with pytest.raises(ValueError, match=r"expected 0\.001 to 10"):
-        dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.0))
-
-
 def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, project_root):
     coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
     coarse.load_state_dict(stokes_unet.state_dict())
@@ -227,17 +214,16 @@ def test_binning_makes_the_network_see_blocks_of_pixels(sequence, stokes_unet, p
     assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows).dolp)
 
 
-@pytest.mark.parametrize(
-    ("network", "side", "words"),
-    [
-        ("paper", 2, "expected network polarnet, got paper; leave binning out"),
-        ("polarnet", 9, "side of 1 to 8 px, got 9"),
-    ],
-)
-def test_binning_that_cannot_be_is_refused(network, side, words, stokes_unet):
+@pytest.mark.parametrize(("network", "option", "words"), [
+    ("paper", {"binning": 2}, "binning: expected network polarnet, got paper; leave binning out"),
+    ("polarnet", {"binning": 9}, "side of 1 to 8 px, got 9"),
+    ("paper", {"thresholds": (0.1, 0.1)}, "expected network polarnet, got paper; leave thresholds out"),
+    ("polarnet", {"thresholds": (0.1, 0.0)}, r"expected 0\.001 to 10"),
+])  # fmt: skip
+def test_options_that_the_network_cannot_use_are_refused(network, option, words, stokes_unet):
     chosen = stokes_unet if network == "polarnet" else torch.nn.Identity()
     with pytest.raises(ValueError, match=words):
-        dolp_recoverer(chosen, COUNTS | {"network": network}, binning=side)
+        dolp_recoverer(chosen, COUNTS | {"network": network}, **option)
 
 
 def test_a_method_without_weights_says_what_to_do(make_setup, checkpoints, tmp_path):

@@ -85,12 +85,6 @@ def test_a_warm_up_leaves_no_trace(name, sequence, make_setup):
 TRAINED_US = 1000
 
 
-def cut(sequence, length_us):
-    first = sequence.events[0]
-    cutter = WindowCutter(WindowRule(length_us, None, None), first.height, first.width)
-    return list(cutter.add(sequence.events, int(sequence.t_us[-1])))
-
-
 def spans_seen(sequence, lengths_us):
     """The windows that a method trained on TRAINED_US sees, given windows of these lengths one by one."""
     runs = []
@@ -123,23 +117,14 @@ def test_short_windows_are_joined_long_ones_cut_and_those_of_about_the_trained_l
     assert spans_seen(sequence, lengths_us) == spans
 
 
-def test_every_event_counts_once_in_the_series_that_ends_with_a_window(sequence, ours):
+def test_every_event_counts_once_in_the_series_that_ends_with_a_window_and_windows_may_come_at_once(sequence, ours):
     """Four windows of a quarter: the frames at every whole window are those of whole windows."""
-    any_length = of_any_length(ours, TRAINED_US)
-    state, quarters = any_length.start(18, 20), []
-    for window in cut(sequence, 250):
-        state, prediction = any_length.step(state, [window])
-        quarters.append(prediction.dolp[0])
-    _, whole = ours.step(ours.start(18, 20), cut(sequence, 1000))
-    torch.testing.assert_close(torch.stack(quarters[3::4]), whole.dolp, atol=1e-4, rtol=1e-4)
-
-
-def test_several_windows_at_once_are_windows_one_by_one(sequence, ours):
-    any_length = of_any_length(ours, TRAINED_US)
-    windows = cut(sequence, 250)
-    _, together = any_length.step(any_length.start(18, 20), windows)
+    any_length, quarters = of_any_length(ours, TRAINED_US), windows_of(sequence, WindowRule(250, None, None))
+    _, together = any_length.step(any_length.start(18, 20), quarters)
     state, frames = any_length.start(18, 20), []
-    for window in windows:
+    for window in quarters:
         state, prediction = any_length.step(state, [window])
         frames.append(prediction.dolp)
     torch.testing.assert_close(torch.cat(frames), together.dolp)
+    _, whole = ours.step(ours.start(18, 20), sequence.windows)
+    torch.testing.assert_close(together.dolp[3::4], whole.dolp, atol=1e-4, rtol=1e-4)

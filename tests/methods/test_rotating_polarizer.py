@@ -83,15 +83,12 @@ def test_only_the_last_half_turn_counts_however_the_events_are_cut_into_windows(
         torch.testing.assert_close(one[-1], expected)
 
 
-def test_the_local_variance_of_one_bright_pixel_in_nine():
+def test_the_local_variance_of_one_bright_pixel_in_nine_and_an_even_square_is_refused():
     frame = torch.zeros(5, 5)
     frame[2, 2] = 1
     assert local_variance(frame, 3)[2, 2].item() == pytest.approx(1 / 9 - 1 / 81)
     assert local_variance(frame, 3)[0, 0].item() == 0.0
     assert local_variance(torch.full((5, 5), 0.7), 3).numpy() == pytest.approx(np.zeros((5, 5)), abs=1e-7)
-
-
-def test_an_even_square_is_refused():
     with pytest.raises(ValueError, match="spread_window: expected an odd number of pixels, got 4"):
         replace(IDEAL, spread_window=4)
 

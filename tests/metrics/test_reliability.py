@@ -35,12 +35,8 @@ def test_sequences_add_up_and_masked_pixels_do_not_count():
     assert together.pixels.sum() == 3
     assert together.pixels[0] == together.pixels[BINS - 1] == 1
     assert together.measured.sum() == 0.75
-
-
-def test_a_curve_of_no_pixel_has_no_error():
-    frames = torch.zeros(1, 1, 1)
     with pytest.raises(ValueError, match="needs pixels"):
-        reliability(frames, frames, frames, torch.zeros(1, 1, 1, dtype=torch.bool)).log_error()
+        reliability(truth, truth, truth, torch.zeros_like(truth, dtype=torch.bool)).log_error()
 
 
 def test_a_bin_spans_half_a_unit_of_log_variance_from_minus_12_to_0():

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -9,14 +11,17 @@ from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import (
     aolp_error_deg,
     correlation,
+    frame_scores,
     gradient_agreement,
     level_mse,
     mse,
     pattern_mse,
     psnr,
+    score,
     spread_mse,
     ssim,
 )
+from polarnet.stokes import Prediction
 
 
 @pytest.fixture
@@ -34,15 +39,11 @@ def test_an_offset_of_a_tenth_is_20_db_and_all_level():
     torch.testing.assert_close(pattern_mse(a, b), torch.zeros(3), atol=1e-12, rtol=0)
 
 
-def test_equal_frames_have_100_db_ssim_1_and_correlation_1(pair):
+def test_equal_frames_have_100_db_ssim_1_and_correlation_1_whatever_their_gain_and_offset_but_not_sign(pair):
     a, _ = pair
     assert psnr(a, a).tolist() == [100.0, 100.0]
     torch.testing.assert_close(ssim(a, a), torch.ones(2))
     torch.testing.assert_close(correlation(a, a), torch.ones(2))
-
-
-def test_correlation_ignores_gain_and_offset_but_not_sign(pair):
-    a, _ = pair
     torch.testing.assert_close(correlation(a, 0.3 * a + 0.1), torch.ones(2))
     torch.testing.assert_close(correlation(a, 1 - a), -torch.ones(2))
 
@@ -56,12 +57,6 @@ def test_a_constant_frame_correlates_0_with_anything_and_has_a_gradient(pair, va
     assert constant.grad.isfinite().all()
 
 
-def test_correlation_is_that_of_numpy(pair):
-    a, b = pair
-    expected = [np.corrcoef(x.flatten(), y.flatten())[0, 1] for x, y in zip(a, b, strict=True)]
-    np.testing.assert_allclose(correlation(a, b), expected, rtol=1e-6)
-
-
 def test_ssim_is_that_of_torchmetrics(pair):
     a, b = (x.double() for x in pair)
     for i in range(2):
@@ -72,25 +67,22 @@ def test_ssim_is_that_of_torchmetrics(pair):
         assert ssim(*(x.float() for x in (a, b)))[i].item() == pytest.approx(expected.item(), rel=1e-4)
 
 
-def test_ssim_has_the_gradient_of_its_finite_differences():
-    generator = torch.Generator().manual_seed(0)
-    a, b = (torch.rand(1, 7, 6, generator=generator, dtype=torch.float64) for _ in range(2))
+def test_ssim_has_the_gradient_of_its_finite_differences_and_keeps_float32_under_autocast(pair):
+    a, b = (image[:1, :7, :6].double() for image in pair)
     assert torch.autograd.gradcheck(lambda x: ssim(x, b), a.requires_grad_())
-
-
-def test_ssim_keeps_float32_under_autocast(pair):
-    a, b = pair
     with torch.autocast("cpu", torch.bfloat16):
-        inside = ssim(a, b)
-    assert torch.equal(inside, ssim(a, b))
+        inside = ssim(*pair)
+    assert torch.equal(inside, ssim(*pair))
 
 
-def test_mse_and_psnr_are_those_of_scikit_image(pair):
+def test_mse_psnr_and_correlation_are_those_of_scikit_image_and_numpy(pair):
     a, b = (x.double() for x in pair)
     for i in range(2):
         pictures = b[i].numpy(), a[i].numpy()
         assert mse(a, b)[i].item() == pytest.approx(mean_squared_error(*pictures), rel=1e-12)
         assert psnr(a, b)[i].item() == pytest.approx(peak_signal_noise_ratio(*pictures, data_range=1), rel=1e-12)
+        expected = np.corrcoef(pictures[0].flatten(), pictures[1].flatten())[0, 1]
+        assert correlation(a, b)[i].item() == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_spread_is_the_error_of_the_own_mean_and_level_and_pattern_add_up(pair):
@@ -105,6 +97,7 @@ def test_gradients_of_equal_ramps_agree_and_half_as_steep_a_one_agrees_less():
     assert gradient_agreement(ramp, ramp + 0.1).item() == pytest.approx(1)
     assert gradient_agreement(ramp, 0.5 * ramp).item() == pytest.approx(2 * 0.5 / (1 + 0.25))
     assert gradient_agreement(ramp, -ramp).item() == pytest.approx(-1)
+    assert gradient_agreement(torch.full((7, 9), 1 / 3), ramp).item() == 0
     assert gradient_agreement(ramp, torch.linspace(0, 1, 7)[:, None].expand(7, 9)).item() == pytest.approx(0, abs=1e-7)
 
 
@@ -115,10 +108,6 @@ def test_gradient_agreement_is_that_of_scikit_images_sobel(pair):
     common = sum((x * y).sum() for x, y in zip(*along, strict=True))
     energy = sum((x * x).sum() for gradient in along for x in gradient)
     assert gradient_agreement(a, b)[0].item() == pytest.approx(2 * common / energy, rel=1e-12)
-
-
-def test_a_constant_frame_agrees_with_no_gradient():
-    assert gradient_agreement(torch.full((5, 5), 1 / 3), torch.rand(5, 5)).item() == 0
 
 
 @pytest.mark.parametrize(("metric", "side"), [(gradient_agreement, 3), (ssim, 6)])
@@ -179,10 +168,10 @@ def test_masked_ssim_is_the_mean_of_the_map_over_the_valid_pixels(pair):
     valid = torch.zeros(24, 31, dtype=torch.bool)
     valid[6:12, 8:20] = True
     mixed = torch.where(valid, other, truth)
-    for a, b, score in zip(mixed, truth, ssim(mixed, truth, valid.expand(2, -1, -1)), strict=True):
+    for a, b, masked in zip(mixed, truth, ssim(mixed, truth, valid.expand(2, -1, -1)), strict=True):
         options = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
         _, whole = structural_similarity(a.numpy(), b.numpy(), full=True, **options)
-        assert score.item() == pytest.approx(float(whole[valid.numpy()].mean()), abs=1e-5)
+        assert masked.item() == pytest.approx(float(whole[valid.numpy()].mean()), abs=1e-5)
 
 
 @pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
@@ -248,3 +237,24 @@ def test_a_slope_below_a_tenth_of_a_stored_step_per_pixel_is_no_edge_on_any_shap
         ramp = (slope * torch.arange(12, dtype=torch.float64)).expand(4, 12)
         for frame in (ramp, ramp.T):
             assert gradient_agreement(frame, frame).item() == pytest.approx(agreement)
+
+
+DOLP = torch.full((3, 8, 8), 0.5)
+OFFSETS = torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
+"""Error of DoLP in each frame: squared 0.16, 0.04 and 0.01."""
+
+
+def test_the_mean_covers_the_frames_after_the_warmup():
+    prediction = Prediction(DOLP + OFFSETS)
+    for warmup, expected in ((0, 0.07), (1, 0.025), (2, 0.01)):
+        assert score(prediction, DOLP, DOLP, warmup)["mse"] == pytest.approx(expected, abs=1e-6)
+    assert score(prediction, DOLP, DOLP)["mse"] == pytest.approx(0.07, abs=1e-6)
+    for warmup in (-1, 3):
+        with pytest.raises(ValueError, match=f"expected 0 to 2, got {warmup}"):
+            score(prediction, DOLP, DOLP, warmup)
+
+
+def test_an_angle_is_scored_if_the_method_predicts_one():
+    assert "aolp_deg" not in frame_scores(Prediction(DOLP), DOLP, DOLP)
+    turned = Prediction(DOLP, aolp=DOLP + math.radians(10))
+    assert frame_scores(turned, DOLP, DOLP)["aolp_deg"].tolist() == pytest.approx([10, 10, 10], abs=1e-4)

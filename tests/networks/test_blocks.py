@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import ConvGRU, Level, ResidualBlock, conv3x3, on_blocks
+from polarnet.networks.base.blocks import ConvGRU, Level, conv3x3, on_blocks
 
 
 def sigmoid(x: float) -> float:
@@ -26,23 +26,6 @@ def test_a_conv_gru_of_one_pixel_is_the_textbook_gru():
     states, last = gru(torch.full((1, 1, 1, 1), x), 1, torch.full((1, 1, 1, 1), state))
     assert math.isclose(states.item(), expected, rel_tol=1e-6)
     assert torch.equal(states, last)
-
-
-def test_a_conv_gru_over_windows_at_once_is_the_same_as_window_by_window():
-    torch.manual_seed(0)
-    gru, x, state = ConvGRU(3), torch.randn(8, 3, 4, 5), torch.randn(2, 3, 4, 5)
-    states, last = gru(x, 2, state)
-    for window, together in zip(x.split(2), states.split(2), strict=True):
-        alone, state = gru(window, 2, state)
-        torch.testing.assert_close(together, alone)
-    torch.testing.assert_close(last, state)
-
-
-def test_a_residual_block_with_zero_weights_is_a_relu():
-    block = ResidualBlock(2)
-    for parameter in block.parameters():
-        torch.nn.init.zeros_(parameter)
-    assert block(torch.tensor([-1.0, 2.0]).view(1, 2, 1, 1)).flatten().tolist() == [0.0, 2.0]
 
 
 @torch.no_grad()

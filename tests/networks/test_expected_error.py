@@ -42,15 +42,12 @@ def test_a_candidate_that_the_network_does_not_trust_does_not_count():
     assert features(candidates, 0 * weights).isfinite().all()
 
 
-def test_much_evidence_hardly_any_and_none_in_a_frame_are_told_apart():
+def test_frames_without_evidence_are_told_apart_and_errors_of_middle_values_have_most_room():
     silence = [features(evidence=share * EVEN)[0, 2].unique().item() for share in (100, 0.2, 0)]
     assert silence == pytest.approx([0, 0.5, 1], abs=0.01)
     evidence = 0 * EVEN
     evidence[..., 0] = 60.0
     assert features(evidence=evidence)[0, 2].unique().item() < 0.01
-
-
-def test_errors_of_middle_values_have_most_room():
     assert features(dolp=0.2)[0, 3].unique().item() == pytest.approx(math.log((0.16 + MIN_ROOM) / USUAL_ROOM))
     assert features(dolp=-0.1)[0, 3].unique().item() == features(dolp=1.1)[0, 3].unique().item()
 

@@ -74,23 +74,6 @@ def test_the_file_of_another_network_is_refused(tmp_path, content, message):
 def test_a_file_gives_the_weights_and_the_number_of_bins(tmp_path, wrap):
     torch.save(wrap(FireNet(3).state_dict()), tmp_path / "x.pth")
     assert FireNet.load(tmp_path / "x.pth").bins == 3
-    with pytest.raises(ValueError, match="this FireNet takes 3 bins, got 5"):
-        FireNet.load(tmp_path / "x.pth")(torch.zeros(1, 5, 8, 8))
-
-
-@torch.no_grad()
-@pytest.mark.parametrize(("build", "parameters"), [(E2vid, 10_712_098), (FireNet, 37_777), (CistaTc, 669_763)])
-def test_windows_at_once_are_windows_one_by_one_with_the_state_carried(build, parameters):
-    torch.manual_seed(0)
-    network, windows, state = build(5).eval(), torch.randn(3, 2, 5, 21, 30), None
-    assert sum(parameter.numel() for parameter in network.parameters()) == parameters
-    together, _ = network.unroll(windows)
-    assert together.shape == (3, 2, 21, 30)
-    assert build is FireNet or 0 < together.min() < together.max() < 1
-    for window, expected in zip(windows, together, strict=True):
-        frame, state = network(window, state)
-        assert torch.equal(frame, expected)
-    assert not torch.allclose(network(windows[-1])[0], together[-1])  # the state matters
 
 
 @pytest.mark.shared

@@ -3,7 +3,7 @@ import importlib.util
 import io
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +12,7 @@ import jaxtyping
 import onnxruntime
 import pytest
 import torch
+from test_dolp_unet import SMALL
 
 from polarnet.cli import main
 from polarnet.config.tree import load
@@ -20,42 +21,16 @@ from polarnet.events.stream import Events
 from polarnet.networks import onnx_export
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.onnx_export import check_program, random_windows
-from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
+from polarnet.networks.paper.dolp_unet import DolpUNet
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
 from polarnet.networks.registry import load_network
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
-CONFIGS = {
-    "paper": DolpUNetConfig(
-        channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
-    ),
-    "polarnet": replace(
-        load(Path(__file__).resolve().parents[2]).networks.polarnet,
-        channels=[8, 8, 8],
-        memories=[0.0, 0.5],
-        decays=[0.9],
-        scales=[1, 3, 0],
-        panorama_scale=5,
-    ),
-}
-REPRESENTATIONS = {"paper": "event_tensor", "polarnet": "event_counts"}
-
-
-def save_small(name: str, folder: Path) -> Path:
-    """A checkpoint of a small network with random weights everywhere."""
-    torch.manual_seed(0)
-    config = CONFIGS[name]
-    network = DolpUNet(config) if isinstance(config, DolpUNetConfig) else StokesUNet(config)
-    tensors = {key: tensor + 0.1 * torch.randn(tensor.shape) for key, tensor in network.state_dict().items()}
-    metadata = {
-        "network": name,
-        "config": asdict(config),
-        "in_channels": 4 if name == "paper" else 8,
-        "representation": REPRESENTATIONS[name],
-        "data": {"events_from": {"scenes": {"synthesize": {"frame_rate_hz": 50.0}}}},
-    }
-    save_checkpoint(folder / f"{name}.safetensors", tensors, metadata)
-    return folder / f"{name}.safetensors"
+POLARNET = replace(
+    load(Path(__file__).resolve().parents[2]).networks.polarnet,
+    channels=[8, 8, 8], memories=[0.0, 0.5], decays=[0.9], scales=[1, 3, 0], panorama_scale=5,
+)  # fmt: skip
+SIZE = ("--height", HEIGHT, "--width", WIDTH)
 
 
 class Written(NamedTuple):
@@ -66,38 +41,32 @@ class Written(NamedTuple):
     printed: str
 
 
-@contextlib.contextmanager
-def unchecked() -> Iterator[None]:
-    """Without the shape checks of jaxtyping, which make tracing several times slower."""
+def save_small(name: str, folder: Path) -> Path:
+    """A checkpoint of a small network with random weights everywhere."""
+    torch.manual_seed(0)
+    network = DolpUNet(SMALL) if name == "paper" else StokesUNet(POLARNET)
+    tensors = {key: tensor + 0.1 * torch.randn(tensor.shape) for key, tensor in network.state_dict().items()}
+    metadata = {
+        "network": name,
+        "config": asdict(SMALL if name == "paper" else POLARNET),
+        "in_channels": 4 if name == "paper" else 8,
+        "representation": network.representation,
+        "data": {"events_from": {"scenes": {"synthesize": {"frame_rate_hz": 50.0}}}},
+    }
+    save_checkpoint(folder / f"{name}.safetensors", tensors, metadata)
+    return folder / f"{name}.safetensors"
+
+
+@pytest.fixture(scope="module", params=["paper", "polarnet"])
+def written(request, tmp_path_factory) -> Written:
+    """Tracing takes seconds, so each network is written once, without the shape checks, which make it slower."""
+    folder = tmp_path_factory.mktemp(request.param)
+    checkpoint, path = save_small(request.param, folder), folder / "polarnet.onnx"
     jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        yield
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
-
-
-def write_small(name: str, folder: Path) -> Written:
-    checkpoint, path = save_small(name, folder), folder / "polarnet.onnx"
-    with unchecked(), contextlib.redirect_stdout(io.StringIO()) as printed:
-        size = ("--height", str(HEIGHT), "--width", str(WIDTH))
-        assert main(["onnx", str(path), "--weights", str(checkpoint), *size]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["onnx", str(path), "--weights", str(checkpoint), *map(str, SIZE)]) == 0
+    jaxtyping.config.update("jaxtyping_disable", False)
     return Written(path, checkpoint, printed.getvalue())
-
-
-@pytest.fixture(scope="module")
-def of_each(tmp_path_factory) -> dict[str, Written]:
-    """Tracing takes seconds, so each network is written once."""
-    return {name: write_small(name, tmp_path_factory.mktemp(name)) for name in CONFIGS}
-
-
-@pytest.fixture(params=list(CONFIGS))
-def written(request, of_each) -> Written:
-    return of_each[request.param]
-
-
-@pytest.fixture
-def small(of_each) -> Path:
-    return of_each["polarnet"].checkpoint
 
 
 @pytest.fixture
@@ -150,22 +119,20 @@ def test_the_file_says_what_it_takes_and_nothing_of_its_machine(written):
 
 
 @pytest.mark.parametrize("difference", [0.1, float("nan")])
-def test_a_file_that_differs_from_torch_is_not_left_behind(of_each, tmp_path, monkeypatch, capsys, difference):
-    right = program_in(of_each["polarnet"].path)
+def test_a_file_that_differs_from_torch_is_not_left_behind(written, tmp_path, monkeypatch, capsys, difference):
+    right = program_in(written.path)
 
     def wrong(*inputs: torch.Tensor) -> list[torch.Tensor]:
         dolp, *others = right(*inputs)
         return [dolp + difference, *others]
 
     monkeypatch.setattr(onnx_export, "_traced", lambda *_: (wrong, {}))
-    out, weights = tmp_path / "n.onnx", of_each["polarnet"].checkpoint
-    size = ("--height", HEIGHT, "--width", WIDTH)
     message = r"not written, because ONNX Runtime does not reproduce torch's outputs: (?s:.*)item \['dolp'\]"
-    assert re.search(message, refusal(capsys, out, "--weights", weights, *size))
-    assert list(tmp_path.iterdir()) == []
-    out.write_bytes(b"an earlier one")
-    assert re.search(message, refusal(capsys, out, "--weights", weights, *size))
-    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"an earlier one"]
+    for before in ([], [b"an earlier one"]):
+        for content in before:
+            (tmp_path / "n.onnx").write_bytes(content)
+        assert re.search(message, refusal(capsys, tmp_path / "n.onnx", "--weights", written.checkpoint, *SIZE))
+        assert [file.read_bytes() for file in tmp_path.iterdir()] == before
 
 
 def refusal(capsys, *arguments: object) -> str:
@@ -175,31 +142,30 @@ def refusal(capsys, *arguments: object) -> str:
 
 
 @pytest.mark.usefixtures("never_traced")
-@pytest.mark.parametrize(
-    ("out", "arguments", "message"),
-    [
-        ("n.pt", [], "expected a file NAME.onnx to write, got"),
-        ("none/n.onnx", [], "no folder; make it first"),
-        ("n.onnx", ["--height", 0], "at least 1 pixel, got 0x180"),
-        ("n.onnx", ["--weights", "none.safetensors"], "none.safetensors is missing"),
-        ("n.onnx", ["--weights", "best.pth"], "NAME.safetensors, got"),
-    ],
-)
-def test_what_cannot_be_written_is_refused_before_the_work(small, tmp_path, capsys, out, arguments, message):
+@pytest.mark.parametrize(("out", "arguments", "message"), [
+    ("n.pt", [], "expected a file NAME.onnx to write, got"),
+    ("none/n.onnx", [], "no folder; make it first"),
+    ("n.onnx", ["--height", 0], "at least 1 pixel, got 0x180"),
+    ("n.onnx", ["--weights", "none.safetensors"], "none.safetensors is missing"),
+    ("n.onnx", ["--weights", "best.pth"], "NAME.safetensors, got"),
+])  # fmt: skip
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, out, arguments, message):
+    small = save_small("polarnet", tmp_path)
     assert message in refusal(capsys, tmp_path / out, "--weights", small, *arguments)
 
 
 @pytest.mark.usefixtures("never_traced")
-@pytest.mark.parametrize("absent", ["onnx", "onnxruntime", "onnxscript"])
-def test_without_the_packages_the_extra_is_named(small, tmp_path, monkeypatch, capsys, absent):
-    real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == absent else real(name))
-    said = refusal(capsys, tmp_path / "n.onnx", "--weights", small)
-    assert f"ONNX files need {absent}: run pip install -e '.[export]' in the clone" in said
+def test_without_the_packages_the_extra_is_named(tmp_path, monkeypatch, capsys):
+    real, small = importlib.util.find_spec, save_small("polarnet", tmp_path)
+    for absent in ("onnx", "onnxruntime", "onnxscript"):
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name, no=absent: None if name == no else real(name))
+        said = refusal(capsys, tmp_path / "n.onnx", "--weights", small)
+        assert f"ONNX files need {absent}: run pip install -e '.[export]' in the clone" in said
 
 
-def test_the_lines_on_the_page_run_as_they_stand(of_each, monkeypatch, project_root):
-    monkeypatch.chdir(of_each["polarnet"].path.parent)
+@pytest.mark.parametrize("written", ["polarnet"], indirect=True)
+def test_the_lines_on_the_page_run_as_they_stand(written, monkeypatch, project_root):
+    monkeypatch.chdir(written.path.parent)
     snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)
     assert snippet is not None
     names: dict = {}

@@ -3,7 +3,15 @@ import math
 import pytest
 import torch
 
-from polarnet.networks.polarnet.panorama import Memory, Motion, certainty, displacements, empty_panorama, follow
+from polarnet.networks.polarnet.panorama import (
+    Memory,
+    Motion,
+    Panorama,
+    certainty,
+    displacements,
+    empty_panorama,
+    follow,
+)
 
 MEMORY = Memory(prior=1.0, noise=0.01, drift=0.01, renewal=0.15, fade=0.95)
 HEIGHT, WIDTH, MARGIN = 44, 60, 16
@@ -64,16 +72,12 @@ def test_windows_that_show_different_things_or_nothing_have_no_motion():
     torch.testing.assert_close(displacements(small, 40).displacement, torch.zeros(1, 1, 2), atol=0.5, rtol=0)
 
 
-def test_one_pixel_that_always_fires_does_not_hide_the_motion():
-    changes = views([(4.0 * k, 1.0 * k) for k in range(3)]).diff(dim=0).sum(1, keepdim=True).round()
-    changes[:, :, 20, 30] = 500.0
-    motion = displacements(changes, reach=8)
-    torch.testing.assert_close(motion.displacement, torch.tensor([[[4.0, 1.0]]]), atol=0.3, rtol=0)
-
-
-def test_streams_are_searched_one_by_one():
-    images = torch.cat([views([(s * k, 0.0) for k in range(4)]).diff(dim=0).sum(1, keepdim=True) for s in (2, 5)], 1)
+def test_one_pixel_that_always_fires_does_not_hide_the_motion_and_streams_are_searched_one_by_one():
+    changes = [views([(k * x, k * y) for k in range(3)]).diff(dim=0).sum(1, keepdim=True) for x, y in ((4, 1), (2, 0))]
+    images = torch.cat(changes, dim=1).round()
+    images[:, 0, 20, 30] = 500.0
     together = displacements(images, reach=8)
+    torch.testing.assert_close(together.displacement[0], torch.tensor([[4.0, 1.0], [2.0, 0.0]]), atol=0.3, rtol=0)
     for stream in range(2):
         alone = displacements(images[:, stream : stream + 1], reach=8)
         torch.testing.assert_close(together.displacement[:, stream], alone.displacement[:, 0])
@@ -85,9 +89,7 @@ def test_following_the_motion_shows_the_scene_where_sums_show_changes_and_noise(
     assert (level - truth).square().mean() < 0.06 * variance
     assert (sums - truth).square().mean() > 0.5 * variance
     noisy, _, _ = followed(path(31), noise=0.5)
-    assert (
-        noisy - level
-    ).square().mean() < 0.01 * 30 * 0.5**2  # noise averages out; this is a share of the sums' noise
+    assert (noisy - level).square().mean() < 0.01 * 30 * 0.5**2  # a share of the noise of the sums
 
 
 def test_what_is_known_grows_with_the_motion_and_fades_without():
@@ -104,16 +106,21 @@ def test_what_is_known_grows_with_the_motion_and_fades_without():
     assert certainty(panorama, MEMORY) < 0.1
 
 
-def test_without_motion_the_picture_changes_as_the_pixels_do():
+def test_without_motion_the_picture_changes_as_the_pixels_do_and_streams_are_followed_one_by_one():
     places = path(6)
     changes = views(places).diff(dim=0)
     panorama = empty_panorama(changes[:1], MARGIN)
-    for k, change in enumerate(changes[:-1]):
-        panorama = follow(change[None], motion_between(places, k), panorama, MEMORY)
+    for n, change in enumerate(changes[:-1]):
+        panorama = follow(change[None], motion_between(places, n), panorama, MEMORY)
     lost = Motion(torch.tensor([[2.0, 1.0]]), torch.tensor([False]))
     after = follow(changes[-1:], lost, panorama, MEMORY)
     torch.testing.assert_close(after.own, panorama.own + changes[-1:])
     torch.testing.assert_close(after.level[..., :HEIGHT, :WIDTH], after.own, atol=1e-4, rtol=0)
+    both = Motion(*(torch.cat(pair) for pair in zip(lost, motion_between(places, 4), strict=True)))
+    together = follow(changes[[-1, -1]], both, Panorama(*(torch.cat([x, x]) for x in panorama)), MEMORY)
+    other = follow(changes[-1:], motion_between(places, 4), panorama, MEMORY)
+    for image, one, two in zip(together, after, other, strict=True):
+        torch.testing.assert_close(image, torch.cat([one, two]), atol=1e-5, rtol=1e-5)
 
 
 def test_one_window_by_hand():
@@ -154,15 +161,3 @@ def test_a_long_recording_leaves_the_filter_sound():
     assert panorama.explained.isfinite().all()
     assert 0.5 < certainty(panorama, MEMORY) < 1
     assert panorama.level.square().mean().sqrt() < 5  # although single windows brought changes of 50
-
-
-def test_every_stream_is_followed_by_itself():
-    places = path(5)
-    changes = views(places).diff(dim=0)
-    here, there = motion_between(places, 0), Motion(torch.tensor([[0.0, -3.0]]), torch.tensor([False]))
-    both = Motion(*(torch.cat(pair) for pair in zip(here, there, strict=True)))
-    together = follow(changes[:2], both, empty_panorama(changes[:2], MARGIN), MEMORY)
-    for stream, motion in enumerate((here, there)):
-        alone = follow(changes[stream : stream + 1], motion, empty_panorama(changes[:1], MARGIN), MEMORY)
-        for image, expected in zip(together, alone, strict=True):
-            torch.testing.assert_close(image[stream : stream + 1], expected, atol=1e-5, rtol=1e-5)

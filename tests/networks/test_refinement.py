@@ -44,15 +44,6 @@ def test_an_event_with_another_one_beside_it_or_before_it_is_not_isolated():
     assert (counts.isolated[1] > counts.isolated[0]).tolist() == [[False, True, True, True]]
 
 
-def test_windows_at_once_are_windows_one_by_one_with_the_state_carried():
-    events, state = noise([0.05, 0.1, 0.1, 0.2], windows=4), []
-    together, last = isolated_events(events, [])
-    for number, window in enumerate(events):
-        counts, state = isolated_events(window[None], state)
-        torch.testing.assert_close(counts.isolated[0], together.isolated[number])
-    torch.testing.assert_close(state, last)
-
-
 def test_the_channel_that_fires_less_is_the_brighter_one_if_there_is_much_shot_noise():
     rate = 2 * USUAL_RATE  # nearly all of it is shot noise
     s1, s2 = level(noise([0.8 * rate, rate, 1.2 * rate, rate])).tolist()

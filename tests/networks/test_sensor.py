@@ -77,18 +77,6 @@ def test_a_threshold_for_off_events_above_that_for_on_events_is_evened_out():
     assert equalised.polarity[-10:].mean().abs() < 0.1 * polarity[-10:].mean().abs()
 
 
-@torch.no_grad()
-def test_windows_at_once_are_windows_one_by_one():
-    polarity, events = counts(mismatched(), 6)
-    equaliser = Equaliser()
-    together, last = equaliser(polarity, events, [])
-    state: list[torch.Tensor] = []
-    for number in range(6):
-        one, state = equaliser(polarity[number, None], events[number, None], state)
-        torch.testing.assert_close(one.polarity[0], together.polarity[number])
-    torch.testing.assert_close(state, last)
-
-
 def test_the_scale_starts_at_1_stays_within_its_limits_and_gives_way_to_a_known_value():
     torch.manual_seed(0)
     scale = Scale()

@@ -61,9 +61,3 @@ def test_relative_position_depends_on_the_offset_alone():
     assert index[0, 4] == index[4, 8] == index[1, 5]  # one down, one right
     assert index[0, 4] != index[4, 0]
     assert index.unique().numel() == 5 * 5
-
-
-def test_attention_of_equal_pixels_is_their_value():
-    value = torch.tensor([2.0, -1.0]).expand(1, 1, 1, 9, 2).contiguous()
-    attended = attend(torch.zeros_like(value), torch.zeros_like(value), value, torch.zeros(1, 9, 9), None)
-    torch.testing.assert_close(attended, value)

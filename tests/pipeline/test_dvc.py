@@ -66,8 +66,7 @@ def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     for name in ("measured", "photographs", "recordings"):
         (folder / "data" / name).mkdir(parents=True)
         (folder / "data" / name / "README.md").touch()
-    for name in ("start", "lpips"):
-        (folder / "data" / "external" / name).mkdir(parents=True)
+    (folder / "data" / "external" / "start").mkdir(parents=True)
     outs = {
         "ingest": ["images"], "synthesize": ["scenes.zarr", "frames.zarr"], "emulate": ["events.zarr"],
         "weights": ["weights/loss.json", "weights/benchmark.json"], "train": ["train/NAME"], "sets": ["sets"],
@@ -168,7 +167,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
         thorough("reports/charts.py", {"calibrate", "report"}),
-        thorough("benchmark/paired.py", {"report"} | ROWS),
+        thorough("benchmark/results.py", {"report"} | ROWS),
         thorough("cli/doctor.py", set()),
     ],
 )
@@ -211,7 +210,6 @@ def test_a_changed_value_runs_what_it_can_change(project, change, stages):
     ("file", "values", "stages"),
     [
         ("data/external/start/net.safetensors", put("train", start="data/external/start/net.safetensors"), {"train"}),
-        thorough("data/external/lpips/alex.pth", put("lpips", path="data/external/lpips/alex.pth"), {"weights"}),
         thorough("weights/e2v.pth", put("rows.e2v", needs="weights/e2v.pth"), {"benchmark@e2v"}),
     ],
 )

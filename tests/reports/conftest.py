@@ -97,7 +97,7 @@ def run_methods(events, frames, folder):
         },
         "conditions": {"sentence": "Sequences of 24x36 pixels (height x width), 0.2 s at 30 frames a second."},
     }
-    costs = dict.fromkeys(methods, Cost(1.5, None, 0, 0.25)) | {"ours": Cost(1.5, 10.4, 37_777, 12.0)}
+    costs = dict.fromkeys(methods, Cost(1.5, None, 0)) | {"ours": Cost(1.5, 10.4, 37_777)}
     write_benchmark(folder, Benchmark(rows, costs, panels), config, seed=1, about=about)
 
 

@@ -39,9 +39,9 @@ def test_the_glossary_has_the_rows_of_the_table_and_no_other():
 
 def test_every_method_is_explained_with_the_weights_that_it_takes():
     files = {
-        name: {"file": "weights.pth.tar", "sha256": "0" * 64, "network": method.weights.networks[0]}
+        name: {"file": "weights.pth.tar", "sha256": "0" * 64, "network": method.networks[0]}
         for name, method in METHODS.items()
-        if method.weights is not None and method.wraps is None
+        if method.networks and method.wraps is None
     }
     entries = dict(glossary(ROWS, files))
     assert len(entries) == len([name for name in ROWS if not name.endswith("+gain")]) + 1  # and the solved gains

@@ -1,13 +1,9 @@
 import itertools
-from collections import Counter
 
 import pytest
 
 from polarnet.benchmark.score import FrameScore
-from polarnet.config.pipeline import context_of
-from polarnet.networks.weights import shipped_weights
-from polarnet.storage.scenes import SceneStore
-from studies.robustness import SENSORS, Scores, headlines, rated_sequence, table_of
+from studies.robustness import SENSORS, Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
 from studies.speed_of_network import EVENTS_PER_PIXEL, random_channels, windows_of
 
@@ -40,25 +36,6 @@ def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
     rows = table_of(scores())
     rows["rows"]["ours"]["error_factor"] = 1.2
     assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
-
-
-def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scenes():
-    def rated(ends: float, between: float) -> dict:
-        return {"rows": {"ours": {"psnr": between}, "ours, window ends": {"psnr": ends}}}
-
-    tables = {"time.2000hz.photographs": rated(20.0, 19.9), "time.2000hz.measured": rated(23.0, 22.7)}
-    assert headlines(tables, "ours")["time"] == {"db_lost_2000hz": pytest.approx(0.3)}
-
-
-def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated):
-    config, scenes = settings("seed=3", "benchmark.warmup_windows=2", "synthesize.duration_s=0.2"), simulated.scenes
-    contexts = {"ours": context_of(config, ["oracle_mean", "ours"], 0.3, shipped_weights())}
-    rated = rated_sequence("a-0", SceneStore.open(scenes), config, contexts)  # 6 windows, 2 of them warm-up
-    numbers = Counter(row.method for row in rated.rows)
-    assert numbers == {"oracle_mean": 48, "ours": 48, "ours, held": 48, "ours, window ends": 4}
-    carried, held = ([row.mse for row in rated.rows if row.method == name] for name in ("ours", "ours, held"))
-    assert carried != held
-    assert 0 < rated.dolp["a"] < 1
 
 
 def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):

@@ -2,9 +2,8 @@
 
 import dataclasses
 
-import pytest
 import torch
-from test_loop import CPU, LOOP, SEED
+from test_loop import LOOP, SEED, run
 
 from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import ssim
@@ -12,10 +11,8 @@ from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.e2p.network import coded_aolp
 from polarnet.storage.events import EventStore
 from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
-from polarnet.training.engine.loop import train, train_batch, validate
-from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.sequences import stack
-from polarnet.training.engine.task import describe, open_split
+from polarnet.training.engine.task import open_split
 
 E2P = E2pConfig(
     **LOOP | {"visits": 1, "windows": 3, "epochs": 1}, bins=5, intensity_lpips=0.0, lpips=0.0, mse=50.0, ssim=1.0
@@ -24,26 +21,10 @@ E2P = E2pConfig(
 
 def test_a_training_of_e2p_leaves_a_checkpoint_of_the_published_size(stores, tmp_path):
     task = e2p_task(E2P, None, SEED)
-    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    recorder = Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, E2P, tmp_path, SEED, CPU))
-    train(task, split, E2P, recorder, SEED, CPU, workers=0)
-    tensors, metadata = load_checkpoint(tmp_path / "out" / "best.safetensors")
+    tensors, metadata = load_checkpoint(run(task, stores, tmp_path, E2P) / "best.safetensors")
     assert metadata["network"] == "e2p"
     assert sum(tensor.numel() for tensor in tensors.values()) == 512_501
     assert metadata["loss"] == {"aolp_mse": 50.0, "aolp_ssim_loss": 1.0, "dolp_mse": 50.0, "dolp_ssim_loss": 1.0}
-
-
-@pytest.mark.thorough
-def test_one_sequence_can_be_learnt_by_heart(stores):
-    config = dataclasses.replace(E2P, windows=None, crop=None, symmetries=False, learning_rate=1e-2)
-    task = e2p_task(config, None, SEED)
-    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    split.train.sequences[1:] = []
-    before = validate(task, split.train, config, CPU, workers=0)["mse"]
-    optimizer, batch = torch.optim.Adam(task.network.parameters(), lr=1e-2), stack([split.train[0]])
-    for _ in range(12):
-        train_batch(task, optimizer, batch, config, CPU)
-    assert validate(task, split.train, config, CPU, workers=0)["mse"] < 0.2 * before
 
 
 def test_the_truth_is_s0_the_coded_angle_and_dolp_and_dolp_is_scored(stores):
@@ -78,16 +59,8 @@ def test_the_loss_is_the_published_one():
 
 def test_pixels_that_are_not_valid_cost_nothing():
     torch.manual_seed(0)
-    loss = e2p_task(E2P, None, SEED).loss
-    truth = torch.rand(1, 2, 3, 16, 16)
+    loss, truth = e2p_task(E2P, None, SEED).loss, torch.rand(1, 2, 3, 16, 16)
     valid = torch.rand(1, 2, 16, 16) < 0.7
     spoilt = torch.where(valid[:, :, None], truth, 5.0)
-    terms = loss(spoilt, truth, valid)
-    assert terms.keys() == {"aolp_mse", "aolp_ssim_loss", "dolp_mse", "dolp_ssim_loss"}
-    assert loss.total(terms).abs() < 1e-4
+    assert loss.total(loss(spoilt, truth, valid)).abs() < 1e-4
     assert loss.total(loss(spoilt, truth)) > 1
-
-
-def test_a_negative_weight_is_refused():
-    with pytest.raises(ValueError, match=r"mse: expected >= 0, got -1\.0"):
-        dataclasses.replace(E2P, mse=-1.0)

@@ -23,41 +23,40 @@ def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None)
     return PolarizationLoss(config, network, dolp_only=True)
 
 
-def test_the_total_is_equation_9():
-    predicted, truth = torch.rand(2, 1, 2, 1, 12, 12).unbind()
-    loss = of_dolp(mse=2.0, ssim=3.0, lpips=0.0)
-    terms = loss(predicted, truth)
-    expected = 2 * (predicted - truth).square().mean() + 3 * (1 - ssim(predicted, truth)).mean()
-    torch.testing.assert_close(loss.total(terms), expected)
-
-
-def test_lpips_is_weighed_with_the_rest_where_there_is_a_network():
+def test_the_total_is_equation_9_with_lpips_where_there_is_a_network():
     torch.manual_seed(0)
     lpips = Lpips("vgg")
-    loss = of_dolp(1.0, 0.0, 10.0, lpips)
-    predicted, truth = torch.rand(1, 2, 1, 32, 32), torch.rand(1, 2, 1, 32, 32)
-    terms = loss(predicted, truth)
-    torch.testing.assert_close(terms["lpips"], lpips(predicted[0, :, 0], truth[0, :, 0]).mean())
-    torch.testing.assert_close(loss.total(terms), terms["mse"] + 10 * terms["lpips"])
+    predicted, truth = torch.rand(2, 1, 2, 1, 32, 32).unbind()
+    a, b = predicted[0, :, 0], truth[0, :, 0]
+    plain = 2 * (a - b).square().mean() + 3 * (1 - ssim(a, b)).mean()
+    for weight, expected in ((0.0, plain), (10.0, plain + 10 * lpips(a, b).mean())):
+        loss = of_dolp(2.0, 3.0, weight, lpips)
+        torch.testing.assert_close(loss.total(loss(predicted, truth)), expected)
+    assert of_dolp(1.0, 1.0, 0.0).weights == {"mse": 1.0, "ssim_loss": 1.0}
 
 
-def test_a_weight_of_lpips_without_a_network_is_refused_and_never_left_out():
+def test_a_loss_of_nothing_and_a_weight_of_lpips_without_a_network_are_refused():
     with pytest.raises(ValueError, match=r"lpips: its weight is 10.0, but there is no LPIPS network"):
         of_dolp(1.0, 1.0, 10.0)
-    assert of_dolp(1.0, 1.0, 0.0).weights == {"mse": 1.0, "ssim_loss": 1.0}
+    with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
+        of_dolp(0.0, 0.0, 0.0)
 
 
 def of_everything(dolp: float, s1: float, s2: float) -> torch.Tensor:
     return torch.tensor([dolp, s1, s2])[None, None, :, None, None].expand(2, 3, 3, 12, 12)
 
 
-def test_angles_are_judged_where_a_network_predicts_them():
-    loss = PolarizationLoss(
-        LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, half_weight=None), None, dolp_only=False
-    )
-    terms = loss(of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4))
+def test_angles_are_judged_where_a_network_predicts_them_at_valid_pixels():
+    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, half_weight=None)
+    loss = PolarizationLoss(config, None, dolp_only=False)
+    predicted, truth = of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4)
+    terms = loss(predicted, truth)
     assert {name: round(term.item(), 5) for name, term in terms.items()} == {"mse": 0.01, "stokes": 0.04}
     assert loss.total(terms).item() == pytest.approx(0.01 + 2 * 0.04)
+    valid = torch.zeros(2, 3, 12, 12, dtype=torch.bool)
+    valid[..., :6] = True
+    terms = loss(predicted, torch.where(valid[:, :, None], predicted, 0.9), valid)
+    assert [term.item() for term in terms.values()] == [0, 0]
 
 
 def of_two_frames(half_weight: float | None) -> tuple[PolarizationLoss, torch.Tensor, torch.Tensor]:
@@ -95,21 +94,6 @@ def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gr
     assert predicted.grad[0].any()
     assert predicted.grad.isfinite().all()
     assert not predicted.grad[1].any()
-
-
-def test_masked_pixels_do_not_count_for_angles():
-    config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=1.0, half_weight=None)
-    valid = torch.zeros(2, 3, 12, 12, dtype=torch.bool)
-    valid[..., :6] = True
-    predicted = of_everything(0.5, 0.5, 0.0)
-    truth = torch.where(valid[:, :, None], predicted, 0.9)
-    terms = PolarizationLoss(config, None, dolp_only=False)(predicted, truth, valid)
-    assert [term.item() for term in terms.values()] == [0, 0]
-
-
-def test_a_loss_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
-        LossConfig(mse=0.0, ssim=0.0, lpips=0.0, stokes=1.0, half_weight=None)
 
 
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():

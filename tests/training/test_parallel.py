@@ -15,6 +15,7 @@ import torch.multiprocessing
 from preloaded import FORKSERVER
 from test_loop import CPU, TRAIN, run, small_task
 
+from polarnet.config.tree import load
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.training.engine.parallel import add_up, join, launched, place
 from polarnet.training.engine.recorder import read_history
@@ -84,25 +85,17 @@ def test_parts_are_the_batch_in_its_order():
     assert len(parts_of(batch, 8)) == 5
 
 
-def test_one_process_starts_no_others_and_adds_nothing_up(project_root, monkeypatch):
-    from polarnet.config.tree import load
-
+def test_one_process_starts_no_others_and_a_stage_that_cannot_start_is_an_error(project_root, monkeypatch):
     runtime = load(project_root).runtime
     assert not launched("stages.train", runtime)
-    monkeypatch.setenv("WORLD_SIZE", "2")  # this is one of two already
-    assert not launched("stages.train", dataclasses.replace(runtime, devices=2))
     assert place() == (0, 1)
     tensor = torch.ones(2)
     add_up([tensor])
     assert torch.equal(tensor, torch.ones(2))
-
-
-def test_a_stage_that_cannot_start_is_an_error(project_root):
-    from polarnet.config.tree import load
-
-    runtime = dataclasses.replace(load(project_root).runtime, devices=2)
     with pytest.raises(RuntimeError, match=r"stages\.missing: a process of 2 on this machine failed"):
-        launched("stages.missing", runtime)
+        launched("stages.missing", dataclasses.replace(runtime, devices=2))
+    monkeypatch.setenv("WORLD_SIZE", "2")  # this is one of two already
+    assert not launched("stages.train", dataclasses.replace(runtime, devices=2))
 
 
 @pytest.mark.thorough

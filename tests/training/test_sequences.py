@@ -36,7 +36,8 @@ def sequence(name: str = "s", windows: int = 3, height: int = 6, width: int = 8)
     return WindowSequence(name, intensity.repeat_interleave(2, dim=1), dolp, aolp, intensity)
 
 
-WHOLE = View(start=0, windows=3, top=0, left=0, height=6, width=8, mirror_x=False, mirror_y=False, turn=0, direction=1)
+WHOLE = View(slice(0, 3), slice(0, 6), slice(0, 8), mirrored=(), turn=0, direction=1)
+PLAIN = ViewConfig(visits=1, windows=None, crop=None, symmetries=False)
 
 
 @pytest.mark.parametrize("turn", range(4))
@@ -53,8 +54,7 @@ def test_renumbered_polarizers_still_obey_the_stokes_equations(turn, direction):
 
 def test_a_view_is_the_same_part_of_inputs_and_truth():
     before = sequence()
-    view = WHOLE._replace(start=1, windows=2, top=2, left=3, height=4, width=5, mirror_x=True)
-    after = apply_view(before, view)
+    after = apply_view(before, View(slice(1, 3), slice(2, 6), slice(3, 8), (-1,), turn=0, direction=1))
     for name in ("inputs", "dolp", "aolp", "intensity"):
         torch.testing.assert_close(getattr(after, name), getattr(before, name)[1:3, ..., 2:6, 3:8].flip(-1))
 
@@ -64,12 +64,10 @@ def test_a_random_view_is_drawn_from_its_generator_and_stays_inside():
     for visit in range(50):
         view = random_view(5, 20, 30, config, generator_for(1, "s", str(visit)))
         assert view == random_view(5, 20, 30, config, generator_for(1, "s", str(visit)))
-        assert 0 <= view.start <= 3
-        assert 0 <= view.top <= 4
-        assert 0 <= view.left <= 13
-        assert (view.windows, view.height, view.width) == (2, 16, 17)
-    plain = ViewConfig(visits=1, windows=None, crop=None, symmetries=False)
-    assert random_view(3, 6, 8, plain, generator_for(1, "s", "0")) == WHOLE
+        for part, size, whole in ((view.windows, 2, 5), (view.rows, 16, 20), (view.columns, 17, 30)):
+            assert part.stop - part.start == size
+            assert 0 <= part.start <= whole - size
+    assert random_view(3, 6, 8, PLAIN, generator_for(1, "s", "0")) == WHOLE
 
 
 def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views():
@@ -110,28 +108,19 @@ def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
     assert inputs.dtype == torch.int8
     assert torch.equal(inputs.float(), counts.inputs)
 
-
-@pytest.mark.parametrize("value", [0.5, 128.0, -129.0, 1e9])
-def test_what_bytes_do_not_hold_is_kept_as_it_is(value):
-    before = sequence()._replace(inputs=torch.full((3, 8, 6, 8), value))
-    assert packed(before, intensity=True) is before
-
-
-def test_a_sequence_without_its_intensity_is_seen_as_before_otherwise():
-    whole, compact = sequence(), packed(sequence(), intensity=False)
-    batch = stack([apply_view(compact, WHOLE)] * 2)
-    assert batch.intensity.numel() == 0
-    assert torch.equal(batch.dolp[:, 1], whole.dolp)
-    assert torch.equal(batch.inputs[:, 1], whole.inputs)
+    less = stack([apply_view(packed(sequence(), intensity=False), WHOLE)] * 2)
+    assert less.intensity.numel() == 0
+    assert torch.equal(less.dolp[:, 1], sequence().dolp)
+    for value in (0.5, 128.0, -129.0, 1e9):  # which bytes do not hold
+        before = sequence()._replace(inputs=torch.full((3, 8, 6, 8), value))
+        assert packed(before, intensity=True) is before
 
 
-def test_a_crop_larger_than_the_image_is_refused():
+def test_a_crop_larger_than_the_image_and_a_batch_of_unequal_lengths_are_refused():
     config = ViewConfig(visits=1, windows=None, crop=[16, 16], symmetries=True)
     with pytest.raises(ValueError, match="at most the 3 windows of 6x8 pixels of the sequences, got 3 of 16x16"):
         random_view(3, 6, 8, config, generator_for(1, "s", "0"))
 
-
-def test_a_batch_of_unequal_lengths_is_refused():
     with pytest.raises(ValueError, match=r"equally many windows, got \[3, 4\]; use batch_size=1"):
         stack([sequence(windows=3), sequence(windows=4)])
 
@@ -143,15 +132,14 @@ def test_the_order_is_a_permutation_that_depends_on_seed_and_epoch():
 
 
 def test_batches_follow_the_order_and_the_last_may_be_small():
-    plain = ViewConfig(visits=1, windows=None, crop=None, symmetries=False)
-    dataset = Visits([sequence("a"), sequence("bb"), sequence("ccc")], plain, seed=1, epoch=0)
+    dataset = Visits([sequence("a"), sequence("bb"), sequence("ccc")], PLAIN, seed=1, epoch=0)
     names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
     assert names == [["ccc", "a"], ["bb"]]
 
 
 def test_a_mask_is_cropped_mirrored_and_stacked_with_its_truth():
     masked = [s._replace(valid=s.dolp > 0.3) for s in (sequence("a"), sequence("bb"))]
-    after = apply_view(masked[0], WHOLE._replace(mirror_x=True, mirror_y=True, turn=3, direction=-1, top=1, height=4))
+    after = apply_view(masked[0], View(slice(0, 3), slice(1, 5), slice(0, 8), (-1, -2), turn=3, direction=-1))
     assert torch.equal(after.valid, after.dolp > 0.3)
     batch = stack(masked)
     assert torch.equal(batch.valid, batch.dolp > 0.3)

@@ -24,11 +24,6 @@ class PublishedNetwork(nn.Module):
         super().__init__()
         self.bins = bins
 
-    def check_bins(self, voxels: Float[Tensor, "b bins h w"]) -> None:
-        """Raise ValueError for a grid with another number of bins."""
-        if voxels.shape[1] != self.bins:
-            raise ValueError(f"this {self.label} takes {self.bins} bins, got {voxels.shape[1]}")
-
     def unroll(
         self, windows: Float[Tensor, "t b bins h w"], state: Any = None
     ) -> tuple[Float[Tensor, "t b *k i j"], Any]:

@@ -57,7 +57,6 @@ class CistaTc(PublishedNetwork):
         self, voxels: Float[Tensor, "b bins h w"], state: CistaState | None = None
     ) -> tuple[Float[Tensor, "b h w"], CistaState]:
         """Return the intensity in [0, 1] at the end of one window, and the next state; `state` is None at the start."""
-        self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         image = torch.zeros_like(padded[:, :1]) if state is None else state.image
         features = self.W0(torch.cat([self.We(padded), self.Wi(image.to(padded.dtype))], dim=1))

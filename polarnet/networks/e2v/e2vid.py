@@ -50,7 +50,6 @@ class E2vid(PublishedNetwork):
         self, voxels: Float[Tensor, "b bins h w"], state: Sequence[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
         """Return the intensity at the end of one window, and the next state; `state` is None at the start."""
-        self.check_bins(voxels)
         top, left, padded = reflected(voxels)
         head = self.head(padded.contiguous(memory_format=torch.channels_last))
         x, skips, after = head, [], []
@@ -94,7 +93,7 @@ def named(**layers: nn.Module | None) -> nn.Sequential:
 
 
 class Recurrent(nn.Module):
-    """A convolution, then a ConvLSTM."""
+    """A convolution, then a ConvLSTM, whose output and memory it returns."""
 
     def __init__(self, conv: nn.Module, channels: int, padding_mode: Padding = "zeros"):
         super().__init__()

@@ -46,7 +46,6 @@ class FireNet(PublishedNetwork):
         self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
     ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
         """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
-        self.check_bins(voxels)
         before1, before2 = state or (None, None)
         after1 = self.G1(self.head(voxels.contiguous(memory_format=torch.channels_last)), before1)
         after2 = self.G2(self.R1(after1), before2)

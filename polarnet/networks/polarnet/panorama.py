@@ -1,17 +1,15 @@
 """Panoramas: log intensities and polarizer contrasts gathered along the motion of the scene, without training.
 
-The sum of a pixel's events measures how much its log intensity has changed since the start. The initial value is
-unknown, and the error grows with every event, because thresholds differ between pixels. A moving scene shows each of
-its points to many pixels, which gives two images of the same scene. `own` holds each pixel's sum of events. `level`
-moves with the scene: after a displacement d, the point at p was at p + d, a factor exp(i f d) in the Fourier domain.
-An error of `own` stays at its pixel, whereas an error of `level` moves with the scene. Each image therefore reveals the
-errors of the other, wherever the scene varies along its motion.
+The sum of a pixel's events measures how much its log intensity has changed since the start. Its initial value is
+unknown, and its error grows with every event, because thresholds differ between pixels. A moving scene shows each of
+its points to many pixels, which gives two images of it: `own` holds each pixel's sum of events, and `level` moves with
+the scene (after a displacement d, a factor exp(i f d) in the Fourier domain). An error of `own` stays at its pixel,
+whereas an error of `level` moves. Each image therefore reveals the errors of the other, wherever the scene varies
+along its motion. `follow` is the Kalman filter of the two, one for each spatial frequency; both start at 0.
 
-`follow` is the Kalman filter of the two images, one for each spatial frequency. At the start both images are 0, with
-the same error. Such registration also removes the fixed pattern of infrared sensors (Hardie et al., Applied Optics
-2000). Mosaicing with event cameras (Kim et al., BMVC 2014) filters pixel by pixel instead.
-
-Lengths are in pixels of the input images; log intensities are in steps, the contrast threshold of an event.
+Such registration also removes the fixed pattern of infrared sensors (Hardie et al., Applied Optics 2000). Mosaicing
+with event cameras (Kim et al., BMVC 2014) filters pixel by pixel instead. Lengths are in pixels of the input images,
+log intensities in steps, the contrast threshold of an event.
 """
 
 import math
@@ -53,14 +51,11 @@ class Motion(NamedTuple):
 
 
 class Panorama(NamedTuple):
-    """State of the filter `follow`; all zeros at the start.
-
-    `level` is larger than the sensor's image and wraps around. Parts of the scene that leave the sensor fade in the
-    margin before they re-enter from the opposite side.
-    """
+    """State of the filter `follow`; all zeros at the start."""
 
     level: Float[Tensor, "b c H W"]
-    """The panorama, up to a constant; the sensor covers the first rows and columns."""
+    """The panorama, up to a constant; the sensor covers the first rows and columns. It wraps around: parts of the scene
+    that leave the sensor fade in the margin before they re-enter from the opposite side."""
     own: Float[Tensor, "b c h w"]
     """Each pixel's own estimate of the scene: the sum of its events minus its estimated error."""
     explained: Float[Tensor, "b 4 H F"]
@@ -71,7 +66,7 @@ class Panorama(NamedTuple):
 def empty_panorama(like: Float[Tensor, "b c h w"], margin: int) -> Panorama:
     """Return the initial state for images of the size of `like`, with a margin of at least `margin` pixels."""
     b, c, h, w = like.shape
-    height, width = _round(h + margin), _round(w + margin)
+    height, width = _rounded(h + margin, w + margin)
     explained = like.new_zeros(b, 4, height, width // 2 + 1)
     return Panorama(like.new_zeros(b, c, height, width), like.new_zeros(b, c, h, w), explained)
 
@@ -84,7 +79,7 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     height, width = images.shape[-2:]
     images = images.clamp(-MAX_EVENTS, MAX_EVENTS)
     # large enough to avoid wrap-around and to hold every displacement of the search
-    size = (_round(max(height, reach + 2) + reach + 1), _round(max(width, reach + 2) + reach + 1))
+    size = _rounded(max(height, reach + 2) + reach + 1, max(width, reach + 2) + reach + 1)
     spectrum = torch.fft.rfft2(images, s=size)
     correlation = torch.fft.irfft2(spectrum[:-1] * spectrum[1:].conj(), s=size)
     correlation = torch.roll(correlation, (reach + 1, reach + 1), (-2, -1))
@@ -104,8 +99,8 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     return Motion(torch.stack([x, y], dim=-1), middle > MIN_CORRELATION * (energy[:-1] * energy[1:]).clamp(min=1e-6))
 
 
-def _round(size: int) -> int:
-    return -(-size // ROUND) * ROUND
+def _rounded(height: int, width: int) -> tuple[int, int]:
+    return -(-height // ROUND) * ROUND, -(-width // ROUND) * ROUND
 
 
 def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -158,8 +153,8 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama
 
 def certainty(panorama: Panorama, memory: Memory) -> Float[Tensor, "b 1 1 1"]:
     """Return the share of the prior variance that is explained, from 0 to 1, as a mean over all frequencies."""
-    size = (panorama.level.shape[-2], panorama.level.shape[-1])
-    share = panorama.explained[:, :1] / _expected(size, memory, panorama.level)[:1]
+    height, width = panorama.level.shape[-2:]
+    share = panorama.explained[:, :1] / _expected((height, width), memory, panorama.level)[:1]
     return share.clamp(0, 1).mean((-1, -2), keepdim=True)
 
 

@@ -9,10 +9,9 @@ For small changes,
 or C = -s1 A + s2 B: one linear equation per pixel, without S0 and without the unknown constants of the logarithms.
 Least squares over neighbours and past windows gives s1 and s2.
 
-Thresholds differ between pixels and changes come in whole steps. This noise of the events biases the second moments in
-the least-squares problem ("errors in variables"); `SecondMoments` subtracts the expected bias, whose size is trained.
-
-The same equation holds for differences between neighbouring pixels, given an image of each log I_k: `SlopeMoments`.
+Thresholds differ between pixels and changes come in whole steps. This noise biases the second moments in the
+least-squares problem ("errors in variables"); `SecondMoments` subtracts the expected bias, whose size is trained. The
+same equation holds for differences between neighbouring pixels, given an image of each log I_k: `SlopeMoments`.
 """
 
 from collections.abc import Iterable, Sequence

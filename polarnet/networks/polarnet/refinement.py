@@ -1,11 +1,10 @@
 """Steps from a coarse map of (s1, s2) to a fine one: the level from shot noise, event sums, and the panorama.
 
-A pixel fires ON and OFF events from shot noise even while its light is constant, and more of them in dim light
-(docs/physics.md). The rates of two crossed channels therefore tell which of them is darker, even where polarization is
-uniform and the redundancy of four channels says nothing. Shot noise is counted where little else fires: a pixel's
-events are isolated if its channel is silent at the eight pixels around it in the same window, and at most one of all
-nine fired in the window before. Isolated events also come from edges of low contrast, so a sensor with few of them says
-nothing.
+Shot noise fires ON and OFF events even under constant light, and more of them in dim light (docs/physics.md). The rates
+of two crossed channels therefore tell which of them is darker, even where polarization is uniform and the redundancy of
+four channels says nothing. Shot noise is counted where little else fires: a pixel's events are isolated if its channel
+is silent at the eight pixels around it in the same window, and at most one of all nine fired in the window before.
+Isolated events also come from edges of low contrast, so a sensor with few of them says nothing.
 
 e0 - e90 counts the change of 2 atanh(s1) at a pixel, and e45 - e135 that of 2 atanh(s2). The network learns the gains
 of such sums and the share of the panorama.

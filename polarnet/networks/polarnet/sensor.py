@@ -1,15 +1,13 @@
 """Contrast thresholds of a sensor, estimated from its events: of pixels relative to each other, and on the whole.
 
-A pixel with half the threshold fires about twice as often. In a moving scene, neighbouring pixels see nearly the same
-changes of light. The number of a pixel's events relative to its neighbours' therefore measures its sensitivity, for ON
-and OFF events apart. Counts are noisy. `Equaliser` also estimates how much sensitivities differ over the sensor, and
-moves each pixel's count towards its neighbours' by the corresponding amount (empirical Bayes). A sensor without
-mismatch keeps its events.
+Neighbouring pixels of a moving scene see nearly the same changes of light, and a pixel with half the threshold fires
+about twice as often. The number of a pixel's events relative to its neighbours' therefore measures its sensitivity.
+Counts are noisy, so `Equaliser` also estimates how much sensitivities differ over the sensor, and moves each pixel's
+count towards its neighbours' by the corresponding amount (empirical Bayes).
 
-The logarithm of light scaled by a factor gives the same events as a threshold divided by it, so events alone cannot
-tell the sensor's threshold from the contrast of the scene. But contrasts differ less between scenes than thresholds
-between sensors, and a lower threshold usually comes with a larger relative mismatch. `Scale`, a small perceptron,
-weighs these clues; the loss of DoLP trains it.
+Events alone cannot tell the sensor's threshold from the contrast of the scene. But contrasts differ less between scenes
+than thresholds between sensors, and a lower threshold usually comes with a larger relative mismatch. `Scale`, a small
+perceptron, weighs these clues; the loss of DoLP trains it.
 """
 
 from typing import NamedTuple

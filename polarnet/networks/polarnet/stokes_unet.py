@@ -121,12 +121,10 @@ class StokesUNet(nn.Module):
     0. Sensor: each event is weighted by its pixel's estimated threshold relative to other pixels', and all event sums
        by the sensor's estimated threshold (module `sensor`).
     1. Mixing: the redundancy gives candidates for (s1, s2) from changes in time and from the panorama's slopes. The
-       U-Net mixes these candidates and a constant with weights for each pixel. The mixture is coarse but on the true
-       scale.
+       U-Net mixes these and a constant at each pixel. The mixture is coarse but on the true scale.
     2. Refinement (module `refinement`): where there is much shot noise, the rates of isolated events move the level of
-       the whole sensor. Event sums, times gains from the U-Net, add the fine structure. The result is averaged with
-       the panorama (module `panorama`), whose unknown constants are fitted to the result around each pixel. The
-       panorama has no trained parameters; the U-Net receives it as an input and chooses its weight at each pixel.
+       the whole sensor. Event sums, times gains from the U-Net, add the fine structure. The result is averaged with the
+       panorama (module `panorama`), whose weight the U-Net chooses at each pixel.
     3. Correction: the U-Net sees the result and adds an unconstrained correction.
 
     The state is a list: two tensors of isolated events, two of the pixels' sensitivities, the event sums, the sums of
@@ -239,7 +237,8 @@ class StokesUNet(nn.Module):
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
         x2 = blocks.on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
-        x2 = F.relu(x2 + self.from_mosaic(_panorama_images(images, certain)))
+        centred = torch.cat([images - images.mean((-1, -2), keepdim=True), certain.expand_as(images[:, :1])], dim=1)
+        x2 = F.relu(x2 + self.from_mosaic(centred.contiguous(memory_format=torch.channels_last)))
         solved = Solved(x2, candidates, [refinement.differences(sums), *wide], images, certain, noise, (height, width))
         last_wide = [means[-1] for means in wide_steps]
         return solved, [*isolated, *sensitivity, steps[-1], moments, *last_wide, *next_panorama]
@@ -353,12 +352,6 @@ class StokesUNet(nn.Module):
     def _unless(self, part: str, x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return `x`, or 0 * x if this part is left out (which keeps the gradient path)."""
         return 0 * x if part in self.without else x
-
-
-def _panorama_images(images: Float[Tensor, "n 4 h w"], certain: Float[Tensor, "n 1 1 1"]) -> Float[Tensor, "n 5 h w"]:
-    """Stack the U-Net's input from the panorama: the images minus their means, and the certainty."""
-    inputs = [images - images.mean((-1, -2), keepdim=True), certain.expand_as(images[:, :1])]
-    return torch.cat(inputs, dim=1).contiguous(memory_format=torch.channels_last)
 
 
 def _event_images(sums: Float[Tensor, "n m 4 h w"], count: Float[Tensor, "n 4 h w"]) -> Float[Tensor, "n c h w"]:

@@ -16,6 +16,7 @@ from polarnet.metrics.similarity import correlation, mse, psnr
 from polarnet.runtime.files import check_room
 from polarnet.runtime.machine import precision_on
 from polarnet.runtime.sections import one_of, section
+from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
@@ -102,28 +103,44 @@ def train(
     check_room(recorder.running, COPIES_OF_WEIGHTS * weights, "the checkpoints")
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
-    progress = recorder.resume(network, optimizer)
+    recorder.resume(network, optimizer)
     wait_for_all()  # every process has read the running checkpoint before the first process writes it again
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
-    trained = progress.epoch == config.epochs
+    trained = len(recorder.history) == config.epochs
     loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
-    for epoch in range(progress.epoch, config.epochs):
+    for epoch in range(len(recorder.history), config.epochs):
         visits = Visits(sequences, config, seed, epoch)
-        order = shuffled(len(visits), seed, epoch)
-        batches = batches_of(visits, order[progress.visits :], config.batch_size, workers)
-        for batch in recorder.show(batches, progress, len(order), config.epochs):
-            set_learning_rate(optimizer, config, (epoch + progress.visits / len(order)) / config.epochs)
-            losses = train_batch(task, optimizer, batch, config, device)
-            progress.add(losses, len(batch.names))
-            recorder.keep(progress, network, optimizer)
-        recorder.end_epoch(progress, network, validate(task, split.val, config, device, workers))
-        recorder.keep(progress, network, optimizer, at_once=True)
+        means = train_epoch(task, optimizer, visits, config, device, workers, show=recorder.writes)
+        scores = validate(task, split.val, config, device, workers)
+        recorder.end_epoch(network, optimizer, means, scores)
     if task.unroll_with_features is not None and recorder.writes:
-        network.load_state_dict(progress.best)
-        fit = calibrate(task, sequences_to_fit(task, split.train), config, device, workers)
-        recorder.calibrated(progress, network, fit)
+        network.load_state_dict(recorder.best)
+        recorder.calibrated(network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers))
     recorder.finish()
+
+
+def train_epoch(
+    task: Task, optimizer: Optimizer, visits: Visits, config: LoopConfig, device: torch.device, workers: int, show: bool
+) -> dict[str, float]:
+    """Return means of the loss and its terms over the steps; FloatingPointError if a loss is infinite or NaN."""
+    sums, steps, done = Counter[str](), 0, 0
+    order, title = shuffled(len(visits), visits.seed, visits.epoch), f"epoch {visits.epoch + 1}/{config.epochs}"
+    with ProgressBar(total=len(order), desc=title, unit="visit", disable=not show) as bar:
+        for batch in batches_of(visits, order, config.batch_size, workers):
+            set_learning_rate(optimizer, config, (visits.epoch + done / len(order)) / config.epochs)
+            for terms in train_batch(task, optimizer, batch, config, device):
+                if not math.isfinite(terms["total"]):
+                    raise FloatingPointError(
+                        f"the loss is {terms['total']} in epoch {visits.epoch + 1} after {steps} steps; lower "
+                        "learning_rate, set gradient_norm, or use precision=fp32"
+                    )
+                sums.update(terms)
+                steps += 1
+            done += len(batch.names)
+            bar.update(len(batch.names))
+            bar.set_postfix(loss=f"{sums['total'] / steps:.4f}")
+    return {name: value / steps for name, value in sums.items()}
 
 
 def train_batch(
@@ -142,7 +159,10 @@ def train_batch(
     for number in range(math.ceil(len(batch.inputs) / config.bptt_windows)):
         task.network.zero_grad()
         sums = torch.zeros(1 + len(task.loss.weights), device=device)
-        counts = [frames_known(frames, valid) for _, frames, valid in (run[number] for run in runs)]
+        counts = [
+            frames.shape[0] * frames.shape[1] if valid is None else int(valid.flatten(2).any(-1).sum())
+            for _, frames, valid in (run[number] for run in runs)
+        ]
         known = torch.tensor(float(sum(counts)), device=device)
         add_up([known])
         for part, count in enumerate(counts):
@@ -155,26 +175,15 @@ def train_batch(
             (share * total).backward()
             states[part] = [tensor.detach() for tensor in state or []]
             sums += share * torch.stack([total, *terms.values()]).detach()
-        add_up([*gradients_of(task.network, processes), sums])
+        if processes > 1:
+            for parameter in task.network.parameters():  # another process may have a gradient that this one has not
+                parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+            add_up([*(parameter.grad for parameter in task.network.parameters() if parameter.grad is not None), sums])
         if config.gradient_norm is not None:
             nn.utils.clip_grad_norm_(task.network.parameters(), config.gradient_norm)
         optimizer.step()
         losses.append(dict(zip(("total", *task.loss.weights), sums.tolist(), strict=True)))
     return losses
-
-
-def frames_known(frames: Tensor, valid: Tensor | None) -> int:
-    """Number of frames (of t x b) that have at least one pixel with known truth."""
-    return frames.shape[0] * frames.shape[1] if valid is None else int(valid.flatten(2).any(-1).sum())
-
-
-def gradients_of(network: nn.Module, processes: int) -> list[Tensor]:
-    """Gradients to sum over processes; zeros stand in for gradients that only other processes may have."""
-    if processes == 1:
-        return []
-    for parameter in network.parameters():
-        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-    return [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
 
 
 def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
@@ -235,11 +244,10 @@ def autocast(precision: str, device: torch.device) -> torch.autocast:
 def sequences_to_fit(task: Task, dataset: WindowDataset) -> WindowDataset:
     """At most MAX_SCENES sequences; those of variants only if the task says for which scenes to fit."""
     varied = dataset.frames.variant_of
-    names = [name for name in dataset.sequences if name not in varied]
-    if task.scene_dolp is not None:
-        names += [name for name in dataset.sequences if name in varied]
-    names = names[:: math.ceil(len(names) / MAX_SCENES)]
-    return WindowDataset(dataset.events, dataset.frames, names, dataset.encode)
+    names = sorted(dataset.sequences, key=lambda name: name in varied)
+    if task.scene_dolp is None:
+        names = [name for name in names if name not in varied]
+    return WindowDataset(dataset.events, dataset.frames, names[:: math.ceil(len(names) / MAX_SCENES)], dataset.encode)
 
 
 @torch.no_grad()
@@ -253,41 +261,41 @@ def calibrate(
     record of the fit for the checkpoint.
     """
     task.network.eval()
-    sampled: dict[str, Scene] = {}
+    scenes: dict[str, Scene] = {}
     mean_squared, mean_dolp = [], []
     for batch in batches_of(dataset, range(len(dataset)), 1, workers):
         scene, mse = sampled_sequence(task, batch, config, device)
         if len(scene.squared):
-            sampled[batch.names[0]] = scene
+            scenes[batch.names[0]] = scene
             mean_squared.append(mse)
             mean_dolp.append((batch.dolp if batch.valid is None else batch.dolp[batch.valid]).mean().item())
     if task.scene_dolp is not None:
-        pictures = [float(name not in dataset.frames.variant_of) for name in sampled]
-        real = weights_for(mean_dolp, *task.scene_dolp)
-        for (name, scene), picture, weight in zip(sampled.items(), pictures, real, strict=True):
-            sampled[name] = scene._replace(weights=scene.weights * (picture + fmean(pictures) * weight))
+        pictures = {name: float(name not in dataset.frames.variant_of) for name in scenes}
+        share = fmean(pictures.values())
+        for (name, scene), weight in zip(scenes.items(), weights_for(mean_dolp, *task.scene_dolp), strict=True):
+            scenes[name] = scene._replace(weights=scene.weights * (pictures[name] + share * weight))
     of_pictures: dict[str, list[Scene]] = {}
-    for name, scene in sampled.items():
+    for name, scene in scenes.items():
         of_pictures.setdefault(dataset.frames.original_of(name), []).append(scene)
-    fit = fitted([joined(scenes) for scenes in of_pictures.values()])
+    fit = fitted([joined(of_picture) for of_picture in of_pictures.values()])
     task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
     task.network.train()
-    return {"sequences": len(sampled), "mse": fmean(mean_squared), "ridge": fit.ridge}
+    return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
 
 
 def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
     """Sampled errors of a batch's only sequence and of one frame without events, and the MSE without that frame."""
     every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
-    runs = list(runs_of(task, batch, config.bptt_windows, device))
     samples: list[Scene] = []
     state: State = None
+    runs = list(runs_of(task, batch, config.bptt_windows, device))
     for run in runs:
         sample, state = sampled_errors(task, run, state, every, config.precision)
         samples.append(sample)
     windows, frames, valid = runs[0]
-    still = (torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1])
-    both = joined([*samples, sampled_errors(task, still, None, every, config.precision)[0]])
-    return both, joined(samples).squared.mean().item()
+    still = torch.zeros_like(windows[:1]), frames[:1], None if valid is None else valid[:1]
+    without_events, _ = sampled_errors(task, still, None, every, config.precision)
+    return joined([*samples, without_events]), joined(samples).squared.mean().item()
 
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:

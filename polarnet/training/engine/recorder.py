@@ -7,13 +7,9 @@ for each epoch, which DVC plots and the report and sweeps read.
 import contextlib
 import csv
 import json
-import math
 import shutil
-import time
 import zipfile
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +20,8 @@ from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.runtime.files import check_seal, claimed, code_digest, publish, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.optimizers import Optimizer
-from polarnet.training.engine.parallel import place, wait_for_all
-from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.parallel import place
 
-KEEP_EVERY_S = 60.0  # writing a running checkpoint of the paper's network takes 0.1 s
 HISTORY = "history.csv"
 
 Row = Mapping[str, Any]
@@ -69,115 +63,64 @@ def best_row(rows: Sequence[Row]) -> Row:
     return min(rows, key=lambda row: row["val"]["mse"])
 
 
-@dataclass
-class Progress:
-    """Progress of a training."""
-
-    epoch: int = 0
-    """Number of complete epochs."""
-    visits: int = 0
-    """Number of visits already trained on in the current epoch."""
-    steps: int = 0
-    """Number of optimizer steps in the current epoch; `sums` adds up the loss and its terms over them."""
-    sums: dict[str, float] = field(default_factory=dict)
-    history: list[Row] = field(default_factory=list)
-    best: dict[str, Tensor] = field(default_factory=dict)
-    """Weights of the epoch with the smallest validation MSE."""
-
-    def add(self, losses: Sequence[Mapping[str, float]], visits: int) -> None:
-        """Add the losses of one batch; FloatingPointError if a loss is infinite or NaN."""
-        sums = Counter(self.sums)
-        for terms in losses:
-            if not math.isfinite(terms["total"]):
-                raise FloatingPointError(
-                    f"the loss is {terms['total']} in epoch {self.epoch + 1} after {self.steps} steps; lower "
-                    "learning_rate, set gradient_norm, or use precision=fp32"
-                )
-            sums.update(terms)
-        self.sums, self.steps, self.visits = dict(sums), self.steps + len(losses), self.visits + visits
-
-    def end_epoch(self, weights: Mapping[str, Tensor], scores: Mapping[str, float]) -> None:
-        """Add a row to the history, keep the weights if they are the best, and start the next epoch."""
-        means = {name: value / self.steps for name, value in self.sums.items()}
-        self.history.append({"epoch": self.epoch, "train": means, "val": dict(scores)})
-        if best_row(self.history) is self.history[-1]:
-            self.best = {name: tensor.detach().cpu().clone() for name, tensor in weights.items()}
-        self.epoch, self.visits, self.steps, self.sums = self.epoch + 1, 0, 0, {}
-
-
 class Recorder:
     """Writes the outputs of a training into the folder `out`, and its running checkpoint below `resume`.
 
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
     and its hash, with that of the code, names the folder of the running checkpoint. Files lie in OUT.partial until
     `finish`, which publishes them and deletes the running checkpoint. If several processes share a training, only the
-    first one writes.
-
-    ValueError while another training writes into `out`. A training that is equal to a running one with another `out`,
-    as two points of a sweep may be, waits until that has ended.
+    first one writes. ValueError while another training writes into `out`, or while an equal one runs.
     """
 
-    def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any], keep_every_s: float = KEEP_EVERY_S):
+    def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any]):
         self.place, self.out = out, out.with_name(f"{out.name}.partial")
-        self.metadata, self.keep_every_s = dict(metadata), keep_every_s
+        self.metadata = dict(metadata)
         key = sha256(json.dumps(self.metadata, sort_keys=True).encode(), code_digest().encode())
         self.running = resume / key[:16]
-        self.kept_at = time.monotonic()
         self.writes = place()[0] == 0
+        self.history: list[Row] = []
+        """Complete epochs."""
+        self.best: dict[str, Tensor] = {}
+        """Weights of the epoch with the smallest validation MSE."""
         self._claims = contextlib.ExitStack()
         if self.writes:
             self._claims.enter_context(claimed(out))
-            waiting = f"waiting until an equal training ends, whose running checkpoint is in {self.running}"
-            self._claims.enter_context(claimed(self.running, lambda: ProgressBar.write(waiting)))
+            self._claims.enter_context(claimed(self.running))
             shutil.rmtree(self.out, ignore_errors=True)
             self.out.mkdir(parents=True)
-        wait_for_all()  # no process reads the running checkpoint of the training that the first one waits for
 
-    def resume(self, network: nn.Module, optimizer: Optimizer) -> Progress:
-        """Restore network and optimizer from the running checkpoint, if there is one; ValueError if it is damaged."""
+    def resume(self, network: nn.Module, optimizer: Optimizer) -> None:
+        """Restore everything from the running checkpoint, if there is one; ValueError if it is damaged."""
         file = self.running / "running.pt"
         if not file.exists():
-            return Progress()
+            return
         content = read_running(file)
         network.load_state_dict(content["network"])
         optimizer.load_state_dict(content["optimizer"])
-        progress = Progress(**content["progress"])
-        ProgressBar.write(f"resuming in epoch {progress.epoch + 1}, from {file}")
-        if self.writes and progress.history and not progress.visits:
-            self._write(progress, network)  # __init__ emptied `out`, so the last epoch's files are written again
-        return progress
+        self.history, self.best = content["history"], content["best"]
+        ProgressBar.write(f"resuming after epoch {len(self.history)}, from {file}")
+        if self.writes:
+            self._write(network)  # __init__ emptied `out`
 
-    def keep(self, progress: Progress, network: nn.Module, optimizer: Optimizer, at_once: bool = False) -> None:
-        """Write the running checkpoint if `at_once`, or if `keep_every_s` have passed since the last one."""
-        if not self.writes or (not at_once and time.monotonic() - self.kept_at < self.keep_every_s):
-            return
-        self.running.mkdir(parents=True, exist_ok=True)
-        states = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
-        with replaced(self.running / "running.pt") as temporary:
-            torch.save({**states, "progress": asdict(progress)}, temporary)
-        self.kept_at = time.monotonic()
-
-    def show(self, batches: Iterable[Batch], progress: Progress, visits: int, epochs: int) -> Iterator[Batch]:
-        """Yield the batches and show a progress bar that counts visits to sequences."""
-        epoch, off = f"epoch {progress.epoch + 1}/{epochs}", not self.writes
-        with ProgressBar(total=visits, initial=progress.visits, desc=epoch, unit="visit", disable=off) as bar:
-            for batch in batches:
-                yield batch
-                bar.update(len(batch.names))
-                bar.set_postfix(loss=f"{progress.sums['total'] / progress.steps:.4f}")
-
-    def end_epoch(self, progress: Progress, network: nn.Module, scores: Mapping[str, float]) -> None:
-        """Close the epoch in `progress` and write checkpoints and history."""
-        progress.end_epoch(network.state_dict(), scores)
+    def end_epoch(
+        self, network: nn.Module, optimizer: Optimizer, means: Mapping[str, float], scores: Mapping[str, float]
+    ) -> None:
+        """Record mean losses and validation scores; write checkpoints, history and the running checkpoint."""
+        self.history.append({"epoch": len(self.history), "train": dict(means), "val": dict(scores)})
+        if best_row(self.history) is self.history[-1]:
+            self.best = {name: tensor.detach().cpu().clone() for name, tensor in network.state_dict().items()}
         if not self.writes:
             return
         ProgressBar.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
-        self._write(progress, network)
+        self._write(network)
+        states = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
+        self.running.mkdir(parents=True, exist_ok=True)
+        with replaced(self.running / "running.pt") as temporary:
+            torch.save({**states, "history": self.history, "best": self.best}, temporary)
 
-    def calibrated(self, progress: Progress, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
+    def calibrated(self, network: nn.Module, expected_errors: Mapping[str, int | float]) -> None:
         """Rewrite the best checkpoint with the fitted expected errors of `network` and the record of the fit."""
-        best = best_row(progress.history)
-        self._save("best", network.state_dict(), best, expected_errors=dict(expected_errors))
+        self._save("best", network.state_dict(), best_row(self.history), expected_errors=dict(expected_errors))
         seal(self.out)
 
     def finish(self) -> None:
@@ -187,11 +130,10 @@ class Recorder:
             shutil.rmtree(self.running, ignore_errors=True)
             self._claims.close()
 
-    def _write(self, progress: Progress, network: nn.Module) -> None:
-        last, best = progress.history[-1], best_row(progress.history)
-        self._save("last", network.state_dict(), last)
-        self._save("best", progress.best, best)
-        write_history(self.out, progress.history)
+    def _write(self, network: nn.Module) -> None:
+        self._save("last", network.state_dict(), self.history[-1])
+        self._save("best", self.best, best_row(self.history))
+        write_history(self.out, self.history)
         seal(self.out)
 
     def _save(self, name: str, weights: Mapping[str, Tensor], row: Row, **more: Any) -> None:

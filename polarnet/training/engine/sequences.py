@@ -49,8 +49,7 @@ class WindowDataset(Dataset[WindowSequence]):
     """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
 
     def __init__(self, events: EventStore | EmulatedEvents, frames: FrameStore, sequences: list[str], encode: Encode):
-        absent = [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]
-        if absent:
+        if absent := [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]:
             raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
         if (events.height, events.width) != (frames.height, frames.width):
             raise ValueError(
@@ -83,38 +82,32 @@ class Batch(NamedTuple):
 
 
 class View(NamedTuple):
-    """An augmented view of a sequence: a range of windows and a crop, optionally mirrored, with renumbered polarizers.
+    """An augmented view of a sequence: some windows, rows and columns, maybe mirrored, with renumbered polarizers.
 
     Polarizer j of the view is polarizer (turn + direction * j) mod 4 of the sequence: the polarizers are rotated by
     turn * 45 degrees against the scene, in reverse order if direction is -1. DoLP does not change.
     """
 
-    start: int
-    windows: int
-    top: int
-    left: int
-    height: int
-    width: int
-    mirror_x: bool
-    mirror_y: bool
+    windows: slice
+    rows: slice
+    columns: slice
+    mirrored: tuple[int, ...]
+    """Axes: -1 and -2."""
     turn: int
     direction: int
 
 
 def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
     """Crop, mirror and renumber a sequence. The four channels and their truth stay exact."""
-    stop, bottom, right = view.start + view.windows, view.top + view.height, view.left + view.width
-    mirrored = [axis for axis, mirror in ((-1, view.mirror_x), (-2, view.mirror_y)) if mirror]
 
     def cropped(frames: Tensor) -> Tensor:
-        return frames[view.start : stop, ..., view.top : bottom, view.left : right].flip(mirrored).contiguous()
+        return frames[view.windows, ..., view.rows, view.columns].flip(view.mirrored).contiguous()
 
     polarizers = [(view.turn + view.direction * j) % 4 for j in range(4)]
     inputs = cropped(sequence.inputs).unflatten(1, (4, -1))[:, polarizers].flatten(1, 2)
-    aolp = view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN)
-    intensity = cropped(sequence.intensity)[:, polarizers]
+    aolp = torch.remainder(view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN), math.pi)
     valid = None if sequence.valid is None else cropped(sequence.valid)
-    aolp = torch.remainder(aolp, math.pi)
+    intensity = cropped(sequence.intensity)[:, polarizers]
     return WindowSequence(sequence.name, inputs, cropped(sequence.dolp), aolp, intensity, valid)
 
 
@@ -146,8 +139,9 @@ def random_view(count: int, height: int, width: int, config: ViewConfig, generat
         )
     start, top, left = generator.integers([count - windows + 1, height - rows + 1, width - columns + 1]).tolist()
     mirror_x, mirror_y, turn, reverse = generator.integers([2, 2, 4, 2]).tolist() if config.symmetries else [0, 0, 0, 0]
-    direction = -1 if reverse else 1
-    return View(start, windows, top, left, rows, columns, bool(mirror_x), bool(mirror_y), turn, direction)
+    mirrored = tuple(axis for axis, mirror in ((-1, mirror_x), (-2, mirror_y)) if mirror)
+    cut = slice(start, start + windows), slice(top, top + rows), slice(left, left + columns)
+    return View(*cut, mirrored, turn, -1 if reverse else 1)
 
 
 class Visits(Dataset[WindowSequence]):
@@ -170,8 +164,7 @@ class Visits(Dataset[WindowSequence]):
 def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> list[WindowSequence] | None:
     """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
-    `workers` processes read and encode them; 0 or 1: this process. Each process of a shared training loads them all.
-    `intensity` says whether to keep the intensity.
+    `workers` processes read and encode them; 0 or 1: this process. `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
     if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * psutil.virtual_memory().available:

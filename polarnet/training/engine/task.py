@@ -20,7 +20,6 @@ from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.groups import is_url
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.losses import FrameLoss
 from polarnet.training.engine.sequences import Batch, WindowDataset
@@ -128,23 +127,14 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
             "height": events.height,
             "width": events.width,
             "events_from": events.attributes,
-            "events_sha256": content_hash(events.path),  # with data=fly: hash of the scenes
-            "frames_sha256": content_hash(frames.path),
+            "events_sha256": store_hash(events.path),  # with data=fly: hash of the scenes
+            "frames_sha256": store_hash(frames.path),
         },
         "versions": {"polarnet": __version__, "torch": torch.__version__},
     }
 
 
-def content_hash(path: str) -> str:
-    """Return the sha256 of all file names and contents at `path`, or of the path string if nothing is there.
-
-    Of a store at a URL, it is the sha256 of zarr.json, which holds the checksum of each part.
-    """
-    if is_url(path):
-        with fsspec.open(f"{path}/zarr.json") as file:
-            return sha256(file.read())
-    if not Path(path).exists():
-        return sha256(path.encode())
-    files = sorted(file for file in [Path(path), *Path(path).rglob("*")] if file.is_file())
-    heads = (f"{file.relative_to(path)}\0{file.stat().st_size}\0".encode() for file in files)
-    return sha256(*(part for pair in zip(heads, files, strict=True) for part in pair))
+def store_hash(path: str) -> str:
+    """Return the sha256 of a store's zarr.json, which holds the checksum of each part, on disk or at a URL."""
+    with fsspec.open(f"{path}/zarr.json") as file:
+        return sha256(file.read())
