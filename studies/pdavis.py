@@ -98,7 +98,7 @@ def write_recordings(made: Path, folder: Path, polarizer_deg: int) -> list[Path]
     events = join_mosaic(store.read(store.sequences[0]), MOSAIC)
     truth = open_truth(made / APPENDED, store.sequences[0])
     inside = np.flatnonzero(truth.t_us >= EXPOSURE_US)
-    frames = [truth[k] for k in inside]
+    frames = [truth[int(k)] for k in inside]
     intensity = intensities_from_stokes(torch.stack([stokes_from_polarization(f.s0, f.dolp, f.aolp) for f in frames]))
     levels = np.rint(WHITE * mosaicked(2 * intensity.numpy()).clip(0, 1)).astype(np.uint8)
     t_us, name = truth.t_us[inside], folder / f"pdavis_{polarizer_deg:03d}"
