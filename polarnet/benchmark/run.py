@@ -14,7 +14,7 @@ from polarnet.events.streaming import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
-from polarnet.storage.frames import dequantise_angle, dequantise_fraction, quantise_angle, quantise_fraction
+from polarnet.storage.frames import dequantise, quantise
 from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, signed_bytes
 
 MAX_FILM_FRAMES = 12
@@ -96,11 +96,11 @@ def at_stored_precision(row: str, sequence: str, prediction: Prediction) -> Pred
                 f"{row} on {sequence}, window {int((~finite).nonzero()[0])}: it predicted values that are not "
                 f"numbers; the method, its weights or the events are damaged"
             )
-    dolp = dequantise_fraction(quantise_fraction(prediction.dolp))
+    dolp = dequantise("dolp", quantise("dolp", prediction.dolp))
     aolp, log_variance = prediction.aolp, prediction.log_variance
     return Prediction(
         dolp,
-        None if aolp is None else dequantise_angle(quantise_angle(aolp.remainder(torch.pi))),
+        None if aolp is None else dequantise("aolp", quantise("aolp", aolp.remainder(torch.pi))),
         None if log_variance is None else log_variance.clamp(LOWEST, HIGHEST).half().float(),
     )
 

@@ -85,7 +85,7 @@ def test_a_window_may_be_open_at_either_end(finished, channels):
 
 def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
     """One channel of 300,000 events in 1 s: 10 ms are 3000 of them, in one or two chunks of 4096 of the 74."""
-    monkeypatch.setattr(store_module, "CHUNK", 2**12)
+    monkeypatch.setattr(EventStore, "chunk", 2**12)
     monkeypatch.setattr(store_module, "INDEX_STEP", 2**10)
     store = EventStore.create(tmp_path / "events.zarr", ["coffee"], HEIGHT, WIDTH, {})
     store.write("coffee", channels["coffee"], DURATIONS_US["coffee"])
@@ -108,7 +108,7 @@ def test_a_window_reads_only_its_own_chunks(channels, tmp_path, monkeypatch):
 
 
 def test_sequences_may_fill_several_chunks_and_steps_of_the_index(make_random_events, tmp_path, monkeypatch):
-    monkeypatch.setattr(store_module, "CHUNK", 128)
+    monkeypatch.setattr(EventStore, "chunk", 128)
     monkeypatch.setattr(store_module, "INDEX_STEP", 50)
     long = [make_random_events(k, 300 * (k + 1), 99_500, HEIGHT, WIDTH) for k in range(4)]
     short = [make_random_events(k, 40, 9_000, HEIGHT, WIDTH) for k in range(4)]

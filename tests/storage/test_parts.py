@@ -11,7 +11,6 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import MappingProxyType
 
 import fsspec
 import numpy as np
@@ -33,7 +32,6 @@ class Numbers(Store):
     FORMAT = "test.numbers"
     VERSION = 3
     chunk = 1024
-    columns = MappingProxyType({"value": "uint16", "pair": "int64"})
 
 
 class Others(Numbers):
@@ -54,7 +52,7 @@ def values_of(name: str) -> np.ndarray:
 
 
 def columns_of(name: str) -> dict[str, np.ndarray]:
-    return {"value": values_of(name), "pair": np.stack([values_of(name)] * 2, axis=1)}
+    return {"value": values_of(name), "pair": np.stack([values_of(name)] * 2, axis=1).astype(np.int64)}
 
 
 def write(store: Numbers, name: str) -> None:
@@ -100,8 +98,8 @@ def test_rows_are_counted_within_their_sequence(finished):
     store = Numbers.open(finished)
     assert np.array_equal(store.read_column("value", "s3", 2000, 5000), values_of("s3")[2000:5000])
     assert [len(store.read_column("value", name, 5990, 7000)) for name in ("s0", "s2")] == [0, 10]
-    one, pair = store.read_columns("s4", [("value", 11_999, None), ("pair", 0, 1)])
-    assert (len(one), pair.tolist()) == (1, [[values_of("s4")[0]] * 2])
+    first, last = store.read_columns("s4", ["value", "pair"], [(0, 1), (11_999, None)])
+    assert (first["pair"].tolist(), last["value"].tolist()) == ([[values_of("s4")[0]] * 2], [values_of("s4")[-1]])
 
 
 def test_any_zarr_reader_finds_a_sequence_and_each_starts_a_chunk_of_its_own(finished):
@@ -364,19 +362,9 @@ def with_header(path: Path, **values) -> Path:
     return path
 
 
-@pytest.mark.parametrize("value", [{"a": 1}, 0, 1.5, "2", None])
-def test_a_header_with_a_valid_checksum_and_absurd_values_is_refused(copy, value):
-    header = {**json.loads((copy / "zarr.json").read_text())["attributes"], "sequences_per_part": value}
-    with pytest.raises(ValueError, match=r"copy\.zarr: the attributes in zarr\.json are not those of a store"):
-        Numbers.open(with_header(copy, sequences_per_part=value, checksum=parts_module._checksum(header)))
-
-
 def test_what_cannot_be_a_store_is_refused(finished, tmp_path):
-    for attribute in (float("nan"), tmp_path):
-        with pytest.raises(ValueError, match="finite, plain JSON"):
-            store_at(tmp_path / "store.zarr", threshold=attribute)
-    with pytest.raises(ValueError, match="at least one sequence per part, got 0"):
-        Numbers.create_parts(tmp_path / "store.zarr", NAMES, {}, 0)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        store_at(tmp_path / "store.zarr", threshold=float("nan"))
     with pytest.raises(ValueError, match="expected each name once, got a again"):
         Numbers.create_parts(tmp_path / "store.zarr", ["a", "b", "a"], {}, 1)
     with pytest.raises(ValueError, match="sequences_per_part: expected > 0, got 0"):
