@@ -1,10 +1,4 @@
-"""The event store, the one on-disk format of simulated and real events.
-
-The four channels of a sequence follow each other in the columns `t` (microseconds from the start of the sequence), `x`,
-`y` and `p` (+1 or -1). A sequence's record holds `offsets`, the start of each channel and the end of the last, and
-`duration_us`, its length. `index` holds, for each channel, the time of every `INDEX_STEP`-th event, so that a window is
-found without reading other events. If the sequence drew parameters of its camera, `drawn` holds their values.
-"""
+"""The event store, the one on-disk format of simulated and real events."""
 
 import bisect
 import itertools
@@ -84,8 +78,8 @@ class EventStore(Store):
     ) -> None:
         """Write the four channels (0, 45, 90, 135 degrees) of the next sequence of a part; see `Store.append`.
 
-        `drawn` (plain JSON) are the camera parameters drawn for this sequence. ValueError, before
-        anything is written, for events out of order, off the sensor or outside [0, duration_us].
+        `drawn` (plain JSON) are the camera parameters drawn for this sequence. ValueError, before anything is
+        written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
         columns = {}
@@ -145,17 +139,16 @@ class EventStore(Store):
         if not 0 < duration_us <= MAX_DURATION_US:
             raise ValueError(f"expected a duration of 1 to {MAX_DURATION_US} us, got {duration_us}; cut the sequence")
         for angle, channel in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
-            if (channel.height, channel.width) != (self.height, self.width):
-                raise ValueError(
-                    f"polarizer {angle}: expected a sensor of {self.height}x{self.width} px, "
-                    f"got {channel.height}x{channel.width}"
-                )
             try:
-                validate(channel)
+                self._check_channel(channel, duration_us)
             except ValueError as error:
                 raise ValueError(f"polarizer {angle}: {error}") from None
-            if len(channel) and not (channel.t[0] >= 0 and channel.t[-1] <= duration_us):
-                raise ValueError(
-                    f"polarizer {angle}: expected times from 0 to the duration of {duration_us} us, "
-                    f"got {int(channel.t[0])} to {int(channel.t[-1])} us"
-                )
+
+    def _check_channel(self, channel: Events, duration_us: int) -> None:
+        size = f"{channel.height}x{channel.width}"
+        if size != f"{self.height}x{self.width}":
+            raise ValueError(f"expected a sensor of {self.height}x{self.width} px, got {size}")
+        validate(channel)
+        if len(channel) and not (channel.t[0] >= 0 and channel.t[-1] <= duration_us):
+            times = f"{int(channel.t[0])} to {int(channel.t[-1])} us"
+            raise ValueError(f"expected times from 0 to the duration of {duration_us} us, got {times}")

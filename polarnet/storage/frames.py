@@ -11,16 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int64, Integer, UInt16
 from torch import Tensor
 
-from polarnet.runtime.arrays import (
-    Array,
-    as_tensor,
-    check_range,
-    check_shape,
-    floats,
-    fractions,
-    mask_of,
-    whole_numbers,
-)
+from polarnet.runtime.arrays import Array, check_range, floats, fractions, mask_of, whole_numbers
 from polarnet.runtime.splits import SPLITS
 from polarnet.storage.parts import Store
 
@@ -60,14 +51,15 @@ class Frames(NamedTuple):
     """Where the truth is known; None: everywhere."""
 
 
-def quantise(name: str, values: Float[Array, "*shape"]) -> UInt16[np.ndarray, "*shape"]:
+def quantise(name: str, values: Float[Array, "*shape"], axes: str = "...") -> UInt16[np.ndarray, "*shape"]:
     """Steps of a quantity: 65536 from 0 to pi for the angle `aolp` in radians, 65535 from 0 to 1 for any other.
 
-    ValueError outside [0, pi) or [0, 1], beyond float32 rounding error. An angle that rounds up to pi becomes 0.
+    ValueError for other axes (see `check_shape`), and outside [0, pi) or [0, 1], beyond float32 rounding error. An
+    angle that rounds up to pi becomes 0.
     """
     if name != "aolp":
-        return (fractions(name, values, "...") * FRACTION_STEPS).round().numpy().astype(np.uint16)
-    angles = floats(name, values, "...")
+        return (fractions(name, values, axes) * FRACTION_STEPS).round().numpy().astype(np.uint16)
+    angles = floats(name, values, axes)
     check_range(name, angles, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
     return ((angles * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
 
@@ -80,12 +72,7 @@ def dequantise(name: str, steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, 
 
 @dataclass(frozen=True)
 class Contents:
-    """The sequences of a store of scenes or frames, and the values that it is made from.
-
-    >>> from polarnet.storage import Contents
-    >>> Contents({"lake-00": "train", "road-00": "test"}, {"seed": 1}).splits["road-00"]
-    'test'
-    """
+    """The sequences of a store of scenes or frames, and the values that it is made from."""
 
     splits: Mapping[str, str]
     """Split (train, val or test) of each sequence, in the store's order."""
@@ -183,8 +170,7 @@ class FrameStore(SplitStore):
             )
         columns = {}
         for name, values, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
-            check_shape(name, as_tensor(name, values), f"{len(times)} {channels}{self.height} {self.width}")
-            columns[name] = quantise(name, values)
+            columns[name] = quantise(name, values, f"{len(times)} {channels}{self.height} {self.width}")
         known = self.checked_mask(valid, dolp.shape)
         if self.masked:
             columns["valid"] = np.packbits(known, axis=-1)
