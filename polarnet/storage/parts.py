@@ -159,17 +159,10 @@ class Store:
             raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
         return self._part_of[sequence]
 
-    def append(
-        self,
-        sequence: str,
-        columns: Mapping[str, np.ndarray],
-        record: Mapping[str, Any],
-        rows_of: str | None = None,
-    ) -> None:
+    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Add the next sequence to its part: rows of every column, and a `record` of plain JSON.
 
-        With `rows_of`, an earlier sequence of the part, both have the rows of that one, and `columns` is ignored. The
-        sequences of a part come in the store's order, from one process; ValueError for another order. The first one
+        The sequences of a part come in the store's order, from one process; ValueError for another order. The first one
         starts the part anew, the last one completes it; a part that is complete stays unchanged. OSError after a part
         if the disk has no room for the missing parts, assumed to be as large as this one.
         """
@@ -182,7 +175,7 @@ class Store:
         expected = names[len(begun.records)] if begun else names[0]
         if begun is None or sequence != expected:
             raise ValueError(f"{self.path}: {part} takes its sequences in order, expected {expected}, got {sequence}")
-        begun.append(sequence, columns, record, rows_of)
+        begun.append(sequence, columns, record)
         if sequence == names[-1]:
             size = self._unfinished.pop(part).finish()
             if not is_url(self.path):
@@ -287,13 +280,8 @@ class _Part:
         self._columns = GrowingColumns(self._temporary, chunk, sharded=True)
         self._stop = 0
 
-    def append(
-        self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any], rows_of: str | None
-    ) -> None:
+    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Add the rows of a sequence, filled up to whole chunks with 0, and hold its record until `finish`."""
-        if rows_of is not None:
-            self.records[sequence] = {**record, "rows": self.records[rows_of]["rows"]}
-            return
         (rows,) = {len(values) for values in columns.values()}
         padding = -rows % self._chunk
         self._columns.append(columns)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape
+from polarnet.runtime.arrays import Array, as_tensor, check_same_shape
 from polarnet.storage.frames import Contents, Polarization, SplitStore, dequantise, quantise
 
 PLANES = ("s0", "dolp", "aolp")
@@ -26,9 +26,7 @@ CONVENTIONS = {
 
 
 class SceneStore(SplitStore):
-    """Scenes and the sequences that move over them; see `create` and `open`.
-
-    A part holds the scenes of its sequences, each once.
+    """The scene of each sequence, and how the sensor moves over it; see `create` and `open`.
 
     >>> import numpy as np
     >>> import torch
@@ -96,9 +94,8 @@ class SceneStore(SplitStore):
     def write(self, sequence: str, scene: Polarization, trajectory: Float64[Array, " k"], duration_us: int) -> None:
         """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
 
-        Sequences over one scene share its pixels in a part. Arrays may be numpy or torch. TypeError for anything but an
-        array. ValueError for values out of range or not finite, integers, planes of different shapes, a scene of an
-        impossible size, or a mask in a store without one.
+        Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
+        finite, integers, planes of different shapes, a scene of an impossible size, or a mask in a store without one.
         """
         names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
@@ -110,10 +107,7 @@ class SceneStore(SplitStore):
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
-        names = self.parts[self.part_of(sequence)]
-        earlier = names[: names.index(sequence)]
-        same = next((other for other in earlier if self.scene_of[other] == self.scene_of[sequence]), None)
-        self.append(sequence, {} if same else self._pixels(self.scene_of[sequence], scene), record, rows_of=same)
+        self.append(sequence, self._pixels(sequence, scene), record)
 
     def read(self, sequence: str) -> Polarization:
         """Scene of a sequence; ValueError names the column of damaged data."""
@@ -134,16 +128,14 @@ class SceneStore(SplitStore):
     def _pixels(self, name: str, scene: Polarization) -> dict[str, np.ndarray]:
         """The columns of a scene; ValueError for a scene that the store cannot hold."""
         planes = {plane: as_tensor(plane, getattr(scene, plane)) for plane in PLANES}
-        for plane, values in planes.items():
-            check_shape(plane, values, "height width")
         check_same_shape(planes)
+        columns = {plane: quantise(plane, values, "height width").ravel() for plane, values in planes.items()}
         size, (height, width) = tuple(scene.s0.shape), self.largest_picture
         if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
             raise ValueError(
                 f"{name}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
                 f"{height}x{width} px, got {size[0]}x{size[1]}"
             )
-        columns = {plane: quantise(plane, values).ravel() for plane, values in planes.items()}
         known = self.checked_mask(scene.valid, size)
         return columns | ({"valid": known.astype(np.uint8).ravel()} if self.masked else {})
 
