@@ -145,7 +145,7 @@ class FrameStore(SplitStore):
         cls, path: str | os.PathLike[str], contents: Contents, n_frames: int, height: int, width: int
     ) -> "FrameStore":
         """Create a store for up to `n_frames` per sequence, or resume it; see `Store.create_parts`."""
-        size = {"n_frames": n_frames, "height": height, "width": width}
+        size: dict[str, Any] = {"n_frames": n_frames, "height": height, "width": width}
         return cls.create_parts(path, list(contents.splits), **vars(contents), **size, conventions=CONVENTIONS)
 
     def write(

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -55,14 +55,16 @@ def write_panel(folder: Path, panel: Panel, rows: Sequence[str] | None = None) -
     """Write the panel as SEQUENCE.npz, with the predictions of `rows` (None: of all)."""
     names = [*panel.predictions] if rows is None else [*rows]
     shown = [panel.truth, *(panel.predictions[name] for name in names)]
-    stacks = dict(zip(Shown._fields, zip(*shown, strict=True), strict=True))
+    arrays: dict[str, Any] = {}
+    for name, maps in zip(Shown._fields, zip(*shown, strict=True), strict=True):
+        arrays[name] = torch.stack([one for one in maps if one is not None]).numpy()
     np.savez_compressed(
         folder / f"{panel.sequence}.npz",
         window=np.int64(panel.window),
         t_us=np.int64(panel.t_us),
         rows=np.array(names, dtype=np.str_),
         with_aolp=np.array([one.aolp is not None for one in shown]),
-        **{name: torch.stack([one for one in maps if one is not None]).numpy() for name, maps in stacks.items()},
+        **arrays,
         **{name: getattr(panel, name).numpy() for name in MAPS},
     )
 

@@ -67,10 +67,6 @@ class SceneStore(SplitStore):
         `scene_of` maps each sequence to the name of its scene. `largest_picture` and `sensor` are (height, width) in
         pixels. ValueError if two sequences of one picture or its variants are in different splits.
         """
-        if scene_of.keys() != contents.splits.keys():
-            raise ValueError(
-                f"expected a scene for each of {len(contents.splits)} sequences, got {len(scene_of)} scenes"
-            )
         split_of: dict[str, str] = {}
         for sequence, picture in {**scene_of, **contents.variant_of}.items():
             split = contents.splits[sequence]
