@@ -84,7 +84,7 @@ def test_validate_names_the_one_wrong_event_wherever_it_is(make_events, place, c
     events = make_events([(10 + i // 3, i % 3, i % 2, 1 - i % 2 * 2) for i in range(1000)], 2, 3)
     assert validate(events) is events
     getattr(events, column)[place] = value
-    with pytest.raises(ValueError, match=f"event {place} of 1000: expected {expected}, got t=.*{column}={value}"):
+    with pytest.raises(ValueError, match=f"event {place} of 1000: expected {expected}, got .*{column}={value}"):
         validate(events)
 
 
