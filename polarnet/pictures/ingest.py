@@ -164,7 +164,8 @@ def files_under(root: Path) -> list[Path]:
             subfolders.clear()
             continue
         read.add(os.path.realpath(folder))
-        subfolders.sort(key=lambda name, folder=folder: (Path(folder, name).is_symlink(), name))
+        places = sorted((Path(folder, name) for name in subfolders), key=lambda path: (path.is_symlink(), path))
+        subfolders[:] = [path.name for path in places]
         files += [Path(folder, name) for name in names]
     return sorted(files)
 
