@@ -75,8 +75,8 @@ def overview_of(data: Path) -> Overview:
 def overview_of_panel(panel: Panel, scenes: SceneStore, frames: FrameStore, events: EventStore) -> Overview:
     """The window of a panel, with the events and frames behind it."""
     scene = scenes.read(panel.sequence)
-    trajectory = Trajectory.from_vector(scene.trajectory.numpy())
-    path = trajectory.pose(np.linspace(0, scene.duration_us / 1e6, 200))
+    trajectory = Trajectory.from_vector(scenes.trajectory(panel.sequence))
+    path = trajectory.pose(np.linspace(0, scenes.duration_us(panel.sequence) / 1e6, 200))
     pose = [float(column[0]) for column in trajectory.pose(np.array([panel.t_us / 1e6]))]
     height, width = scenes.sensor_height, scenes.sensor_width
     left, top, along, across = sensor_to_scene(*pose, height, width)

@@ -93,7 +93,7 @@ def errors_of(
         "start_frames": landmark_us * 1e-6 * rig.picture_rate_hz,
         "refined_ms": float(np.abs(spread_us(found.start_us, truth.start_us)).max()) / 1000,
         "zero_ms": abs(zero_us) / 1000,
-        "squared_dolp": float((frames.dolp(name) - expected).pow(2).mean()),
+        "squared_dolp": float((frames.quantity("dolp", name) - expected).pow(2).mean()),
     }
     print(name, {key: round(value, 4) for key, value in errors.items()}, flush=True)
     return errors

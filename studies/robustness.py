@@ -173,9 +173,9 @@ def scored_sequence(
 
 def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
     """A stored scene with the events of the configured camera, which moves as when the scene was made."""
-    record = scenes.read(name)
-    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    stored = scenes.read(name)
+    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    trajectory = Trajectory.from_vector(scenes.trajectory(name))
     t_us = torch.tensor(frame_times_us(config.synthesize))
     size = scenes.sensor_height, scenes.sensor_width
     events = emulate_motion(config.camera.drawn(config.seed, name), scene, trajectory, int(t_us[-1]), size, 1)

@@ -146,8 +146,8 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
     from polarnet.simulation.truth import frames_of
-    from polarnet.storage.frames import Contents, FrameStore
-    from polarnet.storage.scenes import Scene, SceneStore, as_stored
+    from polarnet.storage.frames import Contents, FrameStore, Polarization
+    from polarnet.storage.scenes import SceneStore, as_stored
 
     folder = tmp_path_factory.mktemp("simulated")
     config = load(project_root)
@@ -173,7 +173,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         coarse = torch.from_numpy(generator.random((1, 3, 12, 16), dtype=np.float32))
         s0, dolp, fraction = torch.nn.functional.interpolate(coarse, (60, 80), mode="bilinear")[0]
         trajectory = random_trajectory(motion, 60, 80, generator)
-        stored = as_stored(Scene(s0, dolp, 3.14 * fraction))
+        stored = as_stored(Polarization(s0, dolp, 3.14 * fraction))
         scenes.write(name, stored, torch.from_numpy(trajectory.to_vector()), t_us[-1])
         scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
         frames.write(name, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *window))

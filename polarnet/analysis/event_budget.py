@@ -32,14 +32,14 @@ SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
 
 def sequence_at(scenes: SceneStore, name: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
     """Events of a stored sequence, with exact truth at the window boundaries `t_us`."""
-    record = scenes.read(name)
-    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-    trajectory = Trajectory.from_vector(record.trajectory.numpy())
+    stored = scenes.read(name)
+    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    trajectory = Trajectory.from_vector(scenes.trajectory(name))
     size = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
-    valid = None if record.valid is None else valid_frames(record.valid, trajectory, t_us.tolist()[1:], *size)
+    valid = None if stored.valid is None else valid_frames(stored.valid, trajectory, t_us.tolist()[1:], *size)
     s0 = intensity[:, 0] + intensity[:, 2]
-    return TestSequence(record.name, record.scene, events, t_us, dolp, aolp, s0, valid)
+    return TestSequence(name, scenes.scene_of[name], events, t_us, dolp, aolp, s0, valid)
 
 
 def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], context: Context) -> dict[str, list[dict]]:

@@ -16,7 +16,7 @@ from polarnet.events.streaming import encode_windows
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
 from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
-from polarnet.storage.frames import dequantise_angle, dequantise_fraction, quantise_angle, quantise_fraction
+from polarnet.storage.frames import dequantise, quantise
 from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, signed_bytes
 
 MAX_FILM_FRAMES = 12
@@ -99,8 +99,8 @@ def at_stored_precision(prediction: Prediction) -> Prediction:
     """The prediction in the steps of the stored truth: DoLP 1/65535, AoLP pi/65536; log-variance as float16."""
     aolp, log_variance = prediction.aolp, prediction.log_variance
     return Prediction(
-        dequantise_fraction(quantise_fraction(prediction.dolp)),
-        None if aolp is None else dequantise_angle(quantise_angle(aolp.remainder(torch.pi))),
+        dequantise("dolp", quantise("dolp", prediction.dolp)),
+        None if aolp is None else dequantise("aolp", quantise("aolp", aolp.remainder(torch.pi))),
         None if log_variance is None else log_variance.clamp(LOWEST, HIGHEST).half().float(),
     )
 

@@ -96,8 +96,9 @@ def train_mean_dolp(frames: FrameStore, warmup_windows: int) -> float:
     """
     total, count = 0.0, 0
     for name in frames.of_split("train"):
-        dolp, valid = frames.dolp(name)[1 + warmup_windows :], frames.valid(name)
-        scored = dolp if valid is None else dolp[valid[1 + warmup_windows :]]
+        scored = frames.quantity("dolp", name)[1 + warmup_windows :]
+        if frames.masked:
+            scored = scored[frames.quantity("valid", name)[1 + warmup_windows :]]
         total, count = total + scored.double().sum().item(), count + scored.numel()
     if count == 0:
         raise ValueError("the mean DoLP needs at least one frame, got none: is the training split empty?")

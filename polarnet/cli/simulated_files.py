@@ -20,7 +20,7 @@ from polarnet.simulation.camera import Camera
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.exchange import FORMS
-from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise_angle, quantise_fraction
+from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.true_frames import APPENDED, open_truth
 from polarnet.terminal.progress import ProgressBar
@@ -118,9 +118,9 @@ def write_simulation(
 def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndarray]:
     return {
         "t_us": np.array(t_us, np.int64),
-        "s0": quantise_fraction(frame[0].clamp(0, 1)),
-        "dolp": quantise_fraction(stokes.dolp(frame).clamp(0, 1)),
-        "aolp": quantise_angle(stokes.aolp(frame)),
+        "s0": quantise("s0", frame[0].clamp(0, 1)),
+        "dolp": quantise("dolp", stokes.dolp(frame).clamp(0, 1)),
+        "aolp": quantise("aolp", stokes.aolp(frame)),
     }
 
 

@@ -87,7 +87,8 @@ class WindowCutter:
     def __init__(self, rule: WindowRule, height: int, width: int, channels: int = 4):
         self.rule = rule
         self._held = [Events.empty(height, width)] * channels
-        self._next_us = rule.length_us if rule.length_us is not None else rule.step_us
+        self._step_us = rule.step_us or rule.length_us
+        self._next_us = rule.length_us or rule.step_us or 0
         self._start_us = 0
         self._until_us = 0
 
@@ -101,11 +102,9 @@ class WindowCutter:
             raise ValueError(f"expected the events of {len(self._held)} channels, got {len(channels)} channels")
         self._check_pauses(channels, until_us)
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
-        if self.rule.length_us is not None:
-            return self._by_time(self.rule.length_us, until_us)
+        if self._step_us is not None:
+            return self._at_steps(self._step_us, until_us)
         assert self.rule.events is not None
-        if self.rule.step_us is not None:
-            return self._last_events(self.rule.events, self.rule.step_us, until_us)
         return self._by_number(self.rule.events, until_us)
 
     def _check_pauses(self, channels: Sequence[Events], until_us: int) -> None:
@@ -121,13 +120,21 @@ class WindowCutter:
                 f"{start_us} and {stop_us} us: a damaged time stamp? cut the recording there"
             )
 
-    def _by_time(self, length_us: int, until_us: int) -> Iterator[EventWindow]:
-        assert self._next_us is not None
+    def _at_steps(self, step_us: int, until_us: int) -> Iterator[EventWindow]:
         while self._next_us <= until_us:
-            start_us = self._next_us - length_us
-            self._forget(self._places(start_us))
-            yield self._window(start_us, self._next_us, self._places(self._next_us))
-            self._next_us += self.rule.step_us or length_us
+            start_us = self._start_of_window(self._next_us)
+            if start_us is not None:
+                self._forget(self._places(start_us))
+                yield self._window(start_us, self._next_us, self._places(self._next_us))
+            self._next_us += step_us
+
+    def _start_of_window(self, stop_us: int) -> int | None:
+        """Start of the window that ends at `stop_us`; None if too few events came before."""
+        if self.rule.events is None:
+            return stop_us - (self.rule.length_us or 0)
+        times = torch.cat([held.t[:n] for held, n in zip(self._held, self._places(stop_us), strict=True)])
+        surplus = len(times) - self.rule.events
+        return int(times.kthvalue(surplus + 1).values) if surplus >= 0 else None
 
     def _by_number(self, count: int, until_us: int) -> Iterator[EventWindow]:
         known = self._places(until_us)
@@ -141,18 +148,6 @@ class WindowCutter:
             self._forget(stops)
             self._start_us = stop_us
             yield window
-
-    def _last_events(self, count: int, step_us: int, until_us: int) -> Iterator[EventWindow]:
-        assert self._next_us is not None
-        while self._next_us <= until_us:
-            stops = self._places(self._next_us)
-            times = torch.cat([held.t[:n] for held, n in zip(self._held, stops, strict=True)])
-            surplus = len(times) - count
-            if surplus >= 0:
-                start_us = int(times.kthvalue(surplus + 1).values)
-                self._forget(self._places(start_us))
-                yield self._window(start_us, self._next_us, self._places(self._next_us))
-            self._next_us += step_us
 
     def _places(self, t_us: int) -> list[int]:
         return [int(torch.searchsorted(held.t, t_us)) for held in self._held]

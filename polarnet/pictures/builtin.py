@@ -16,14 +16,8 @@ class BuiltinPhoto:
 
     @property
     def path(self) -> Path:
-        """Path in the installed scikit-image; FileNotFoundError if the file is missing."""
-        path = Path(str(resources.files("skimage"))) / "data" / self.file
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{self.file} is not in the data folder of the installed scikit-image; reinstall it as constraints.txt "
-                f"pins it, or use your own pictures with ingest.source=folder"
-            )
-        return path
+        """Path in the installed scikit-image."""
+        return Path(str(resources.files("skimage"))) / "data" / self.file
 
 
 # Origins, licences and authors from the docstrings of skimage.data, scikit-image 0.26. Of the stereo pair of

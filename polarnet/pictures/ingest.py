@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import itertools
 import logging
 import os
 import re
@@ -23,7 +22,7 @@ from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import UnreadablePicture, extension, picture_extensions, write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, split_by_content, write_manifest
 from polarnet.pictures.polarimetry import group_by_measurement, parse_raw_mosaic
-from polarnet.runtime.files import claimed, sha256
+from polarnet.runtime.files import claimed, publish, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.runtime.splits import SPLITS
@@ -95,8 +94,7 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
             logger.warning("skipped %s: %s", skipped.file, skipped.reason)
         _check_not_empty(config, manifest)
         write_manifest(manifest, temporary)
-        shutil.rmtree(folder, ignore_errors=True)
-        temporary.rename(folder)
+        publish(temporary, folder)
     return manifest
 
 
@@ -158,20 +156,17 @@ def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipp
 
 
 def files_under(root: Path) -> list[Path]:
-    """Files and dead links in a folder, its subfolders and then its linked folders, sorted; no folder is read twice."""
+    """Files and dead links in a folder, its subfolders and linked folders, sorted; no folder is read twice."""
     files: list[Path] = []
     read: set[str] = set()
-    folders = [root]
-    while folders:
-        links = []
-        for folder, subfolders, names in itertools.chain.from_iterable(map(os.walk, folders)):
-            if os.path.realpath(folder) in read:
-                subfolders.clear()
-                continue
-            read.add(os.path.realpath(folder))
-            files += [Path(folder, name) for name in names]
-            links += [path for path in (Path(folder, name) for name in subfolders) if path.is_symlink()]
-        folders = sorted(links)
+    for folder, subfolders, names in os.walk(root, followlinks=True):
+        if os.path.realpath(folder) in read:
+            subfolders.clear()
+            continue
+        read.add(os.path.realpath(folder))
+        places = sorted((Path(folder, name) for name in subfolders), key=lambda path: (path.is_symlink(), path))
+        subfolders[:] = [path.name for path in places]
+        files += [Path(folder, name) for name in names]
     return sorted(files)
 
 

@@ -175,15 +175,12 @@ def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
 def _read_npz(path: Path) -> Shaped[np.ndarray, "4 h w"]:
     try:
         with np.load(path) as file:
-            missing = [key for key in NPZ_KEYS if key not in file]
-            if missing:
-                raise UnreadablePicture(f"expected the arrays {', '.join(NPZ_KEYS)}, {', '.join(missing)} is missing")
-            arrays = [file[key] for key in NPZ_KEYS]
-    except UnreadablePicture:
-        raise
+            arrays = {key: file[key] for key in NPZ_KEYS if key in file}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise UnreadablePicture(f"cannot be read: {error}".replace(str(path), path.name)) from error
-    return _stacked(arrays, NPZ_KEYS)
+    if missing := [key for key in NPZ_KEYS if key not in arrays]:
+        raise UnreadablePicture(f"expected the arrays {', '.join(NPZ_KEYS)}, {', '.join(missing)} is missing")
+    return _stacked([*arrays.values()], NPZ_KEYS)
 
 
 def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:

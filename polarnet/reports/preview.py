@@ -29,7 +29,8 @@ from polarnet.reports.maps import (
 )
 from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
-from polarnet.storage.true_frames import TrueFrame, TrueFrames
+from polarnet.storage.frames import Polarization
+from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
@@ -75,7 +76,7 @@ class Sheet:
         return with_even_sides(np.array(sheet))
 
     def truth(
-        self, channels: Sequence[Events], truth: TrueFrame, span_us: tuple[int, int], gamma: float = 1.0
+        self, channels: Sequence[Events], truth: Polarization, span_us: tuple[int, int], gamma: float = 1.0
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The events of `span_us` (start and end) behind each polarizer, and the truth at its end.
 
@@ -126,8 +127,9 @@ def write_true_video(
     >>> import torch
     >>> from polarnet.events import Events
     >>> from polarnet.reports import write_true_video
-    >>> from polarnet.storage.true_frames import TrueFrame, TrueFrames
-    >>> frame = TrueFrame(*torch.full((3, 20, 30), 0.5))
+    >>> from polarnet.storage.frames import Polarization
+    >>> from polarnet.storage.true_frames import TrueFrames
+    >>> frame = Polarization(*torch.full((3, 20, 30), 0.5))
     >>> truth = TrueFrames(np.array([0, 33_333]), lambda start, stop: [frame] * (stop - start))
     >>> write_true_video(Path("grey.mp4"), [Events.empty(20, 30)] * 4, truth).dtype
     dtype('uint8')

@@ -16,7 +16,7 @@ from polarnet.recordings.arrangements import read_plain
 from polarnet.recordings.recording import Recording, read_recording
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore, dequantise_angle, dequantise_fraction
+from polarnet.storage.frames import FrameStore, dequantise
 from polarnet.storage.groups import open_group
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.scenes import SceneStore
@@ -80,8 +80,8 @@ def _films(path: Path, sequences: Sequence[str], read: Callable[[Path], Recordin
     elif form == FrameStore.FORMAT:
         store = FrameStore.open(path)
         for name in _chosen(path, store.sequences, sequences):
-            truth_maps = _truth(store.intensity(name)[1:, ::2].sum(1), store.dolp(name)[1:], store.aolp(name)[1:])
-            yield Film(name, store.t_us(name).tolist()[1:], truth_maps)
+            t_us, intensity, dolp, aolp, _ = store.frames(name, 1)
+            yield Film(name, t_us.tolist(), _truth(intensity[:, ::2].sum(1), dolp, aolp))
     elif form == SceneStore.FORMAT:
         scenes = SceneStore.open(path)
         for name in _chosen(path, list(scenes.scene_of), sequences):
@@ -122,7 +122,7 @@ def _appended_film(path: Path) -> Film:
     t_us = arrays.pop("t_us")[:][places].tolist()
     frames = {APPENDED[name]: np.stack([array[int(k)] for k in places]) for name, array in arrays.items()}
     read = {
-        kind: angle_bytes(dequantise_angle(steps)) if kind == "aolp" else fraction_bytes(dequantise_fraction(steps))
+        kind: (angle_bytes if kind == "aolp" else fraction_bytes)(dequantise(kind, steps))
         for kind, steps in frames.items()
     }
     return Film(path.parent.name, t_us, _maps("truth" if path.stem == "truth" else path.stem, read))

@@ -47,10 +47,11 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 
     Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
     """
-    record, size = scenes.read(sequence), (scenes.sensor_height, scenes.sensor_width)
-    scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-    trajectory = Trajectory.from_vector(record.trajectory.numpy())
-    return emulate_motion(camera.drawn(seed, sequence), scene, trajectory, record.duration_us, size, threads)
+    stored, size = scenes.read(sequence), (scenes.sensor_height, scenes.sensor_width)
+    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    trajectory = Trajectory.from_vector(scenes.trajectory(sequence))
+    duration_us = scenes.duration_us(sequence)
+    return emulate_motion(camera.drawn(seed, sequence), scene, trajectory, duration_us, size, threads)
 
 
 def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:

@@ -103,8 +103,8 @@ def _emulate_part(
     pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     others = [Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)
     for sequence in events.parts[part]:
-        record, drawn = scenes.read(sequence), camera.drawn(seed, sequence, "rotating")
-        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        trajectory = Trajectory.from_vector(record.trajectory.numpy())
-        output = emulate_rotating(rotating, drawn, scene, trajectory, record.duration_us, pixels)
-        events.write(sequence, [output, *others], record.duration_us, camera.draws(seed, sequence))
+        stored, drawn = scenes.read(sequence), camera.drawn(seed, sequence, "rotating")
+        scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+        trajectory, duration_us = Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
+        output = emulate_rotating(rotating, drawn, scene, trajectory, duration_us, pixels)
+        events.write(sequence, [output, *others], duration_us, camera.draws(seed, sequence))

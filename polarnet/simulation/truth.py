@@ -24,8 +24,8 @@ from polarnet.simulation.camera import IDEAL, channel_size, grid
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.variation import VariationConfig, varied
-from polarnet.storage.frames import Contents, FrameStore
-from polarnet.storage.scenes import Scene, SceneStore, as_stored
+from polarnet.storage.frames import Contents, FrameStore, Polarization
+from polarnet.storage.scenes import SceneStore, as_stored
 
 logger = logging.getLogger(__name__)
 
@@ -170,13 +170,13 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 
-def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Scene:
+def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Polarization:
     """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
     polarization, valid = _read_polarization(synthesis.images, picture)
     if synthesis.variation and scene != picture:
         polarization = varied(polarization, synthesis.variation, generator_for(synthesis.seed, scene, "variation"))
     s0, dolp, aolp = polarization
-    return as_stored(Scene(s0, dolp, aolp, valid))
+    return as_stored(Polarization(s0, dolp, aolp, valid))
 
 
 def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:

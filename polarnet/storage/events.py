@@ -1,10 +1,4 @@
-"""The event store, the one on-disk format of simulated and real events.
-
-The four channels of a sequence follow each other in the columns `t` (microseconds from the start of the sequence), `x`,
-`y` and `p` (+1 or -1). A sequence's record holds `offsets`, the start of each channel and the end of the last, and
-`duration_us`, its length. `index` holds, for each channel, the time of every `INDEX_STEP`-th event, so that a window is
-found without reading other events. If the sequence drew parameters of its camera, `drawn` holds their values.
-"""
+"""The event store, the one on-disk format of simulated and real events."""
 
 import bisect
 import itertools
@@ -20,7 +14,9 @@ from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG
 from polarnet.storage.parts import Store
 
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
-CHUNK = 2**18  # events; smaller chunks make Zarr slower, for a window as well as for a whole sequence
+CHUNK = (
+    2**18
+)  # events compressed together; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 INDEX_STEP = 2**14  # events
 COLUMNS = {"t": "uint32", "x": "uint16", "y": "uint16", "p": "int8"}
 
@@ -49,14 +45,9 @@ class EventStore(Store):
 
     FORMAT = "polarnet.events"
     VERSION = 5
-    columns = COLUMNS
+    chunk = CHUNK
     height: int
     width: int
-
-    @property
-    def chunk(self) -> int:
-        """Events that are compressed together."""
-        return CHUNK
 
     @classmethod
     def create(
@@ -87,13 +78,10 @@ class EventStore(Store):
     ) -> None:
         """Write the four channels (0, 45, 90, 135 degrees) of the next sequence of a part; see `Store.append`.
 
-        `drawn` (plain JSON) are the camera parameters drawn for this sequence. A sequence that is already written stays
-        unchanged, since the store's attributes determine its events.
-        ValueError, before anything is written, for events out of order, off the sensor or outside [0, duration_us].
+        `drawn` (plain JSON) are the camera parameters drawn for this sequence. ValueError, before anything is
+        written, for events out of order, off the sensor or outside [0, duration_us].
         """
         self._check(channels, duration_us)
-        if self.is_written(sequence):
-            return
         columns = {}
         for name, dtype in COLUMNS.items():  # narrower types, which hold every value that `_check` accepts
             pieces = [getattr(channel, name).numpy() for channel in channels]
@@ -108,10 +96,6 @@ class EventStore(Store):
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
         return self.record(sequence)["duration_us"]
-
-    def drawn(self, sequence: str) -> dict[str, Any]:
-        """Values of the camera's parameters that the sequence drew, by section of params.yaml; empty if none."""
-        return self.record(sequence).get("drawn", {})
 
     def count(self, sequence: str) -> tuple[int, ...]:
         """Number of events in each channel of a sequence."""
@@ -137,17 +121,16 @@ class EventStore(Store):
 
     def _events(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
         """The events in each of the spans (start, stop) of a sequence's rows."""
-        values = self.read_columns(sequence, [(name, *span) for span in spans for name in self.columns])
         return [
             Events(
-                torch.from_numpy(t.astype(np.int64)),
-                torch.from_numpy(x.view(np.int16)),
-                torch.from_numpy(y.view(np.int16)),
-                torch.from_numpy(p),
+                torch.from_numpy(rows["t"].astype(np.int64)),
+                torch.from_numpy(rows["x"].view(np.int16)),
+                torch.from_numpy(rows["y"].view(np.int16)),
+                torch.from_numpy(rows["p"]),
                 self.height,
                 self.width,
             )
-            for t, x, y, p in zip(*(values[i::4] for i in range(4)), strict=True)
+            for rows in self.read_columns(sequence, COLUMNS, spans)
         ]
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
@@ -156,17 +139,16 @@ class EventStore(Store):
         if not 0 < duration_us <= MAX_DURATION_US:
             raise ValueError(f"expected a duration of 1 to {MAX_DURATION_US} us, got {duration_us}; cut the sequence")
         for angle, channel in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
-            if (channel.height, channel.width) != (self.height, self.width):
-                raise ValueError(
-                    f"polarizer {angle}: expected a sensor of {self.height}x{self.width} px, "
-                    f"got {channel.height}x{channel.width}"
-                )
             try:
-                validate(channel)
+                self._check_channel(channel, duration_us)
             except ValueError as error:
                 raise ValueError(f"polarizer {angle}: {error}") from None
-            if len(channel) and not (channel.t[0] >= 0 and channel.t[-1] <= duration_us):
-                raise ValueError(
-                    f"polarizer {angle}: expected times from 0 to the duration of {duration_us} us, "
-                    f"got {int(channel.t[0])} to {int(channel.t[-1])} us"
-                )
+
+    def _check_channel(self, channel: Events, duration_us: int) -> None:
+        size = f"{channel.height}x{channel.width}"
+        if size != f"{self.height}x{self.width}":
+            raise ValueError(f"expected a sensor of {self.height}x{self.width} px, got {size}")
+        validate(channel)
+        if len(channel) and not (channel.t[0] >= 0 and channel.t[-1] <= duration_us):
+            times = f"{int(channel.t[0])} to {int(channel.t[-1])} us"
+            raise ValueError(f"expected times from 0 to the duration of {duration_us} us, got {times}")

@@ -1,27 +1,17 @@
 """Ground truth of event sequences: exact frames of intensity, DoLP and AoLP, quantised to 16 bits, in Zarr v3."""
 
-import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, Integer, UInt8, UInt16
+from jaxtyping import Bool, Float, Int64, Integer, UInt16
 from torch import Tensor
 
-from polarnet.runtime.arrays import (
-    Array,
-    as_tensor,
-    check_range,
-    check_shape,
-    floats,
-    fractions,
-    mask_of,
-    whole_numbers,
-)
+from polarnet.runtime.arrays import Array, check_range, floats, fractions, mask_of, whole_numbers
 from polarnet.runtime.splits import SPLITS
 from polarnet.storage.parts import Store
 
@@ -37,7 +27,17 @@ CONVENTIONS = {
     "valid": "whether the truth of a pixel is known, 8 pixels of a row a byte, the leftmost in the highest bit",
 }
 
-T = TypeVar("T", bound="SplitStore")
+
+class Polarization(NamedTuple):
+    """S0, DoLP and AoLP over the sensor (a frame) or over a larger area (a scene)."""
+
+    s0: Float[Tensor, "h w"]
+    """In [0, 1]."""
+    dolp: Float[Tensor, "h w"]
+    aolp: Float[Tensor, "h w"]
+    """Radians in [0, pi)."""
+    valid: Bool[Tensor, "h w"] | None = None
+    """Where the light is known; None: everywhere."""
 
 
 class Frames(NamedTuple):
@@ -51,44 +51,28 @@ class Frames(NamedTuple):
     """Where the truth is known; None: everywhere."""
 
 
-def quantise_fraction(fraction: Float[Array, "*shape"], name: str = "fraction") -> UInt16[np.ndarray, "*shape"]:
-    """Quantise a quantity of [0, 1] to 65535 steps; ValueError outside, beyond float32 rounding error."""
-    return (fractions(name, fraction, "...") * FRACTION_STEPS).round().numpy().astype(np.uint16)
+def quantise(name: str, values: Float[Array, "*shape"], axes: str = "...") -> UInt16[np.ndarray, "*shape"]:
+    """Steps of a quantity: 65536 from 0 to pi for the angle `aolp` in radians, 65535 from 0 to 1 for any other.
 
-
-def dequantise_fraction(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Invert `quantise_fraction`."""
-    return torch.from_numpy(steps.astype(np.float32)).div_(FRACTION_STEPS)
-
-
-def quantise_angle(angle: Float[Array, "*shape"], name: str = "angle") -> UInt16[np.ndarray, "*shape"]:
-    """Quantise radians of [0, pi) to 65536 steps round the circle; ValueError outside.
-
-    A value that rounds up to pi becomes 0.
+    ValueError for other axes (see `check_shape`), and outside [0, pi) or [0, 1], beyond float32 rounding error. An
+    angle that rounds up to pi becomes 0.
     """
-    checked = floats(name, angle, "...")
-    check_range(name, checked, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
-    return ((checked * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
+    if name != "aolp":
+        return (fractions(name, values, axes) * FRACTION_STEPS).round().numpy().astype(np.uint16)
+    angles = floats(name, values, axes)
+    check_range(name, angles, 0, math.pi, "radians", "fold them into [0, pi), degrees after torch.deg2rad")
+    return ((angles * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
 
 
-def dequantise_angle(steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Invert `quantise_angle`."""
-    return torch.from_numpy(steps.astype(np.float32)).mul_(math.pi / ANGLE_STEPS)
-
-
-def unpack_mask(packed: UInt8[np.ndarray, "*b h bytes"], width: int) -> Bool[Tensor, "*b h w"]:
-    """Mask from bytes of 8 pixels of a row each, the leftmost in the highest bit."""
-    return torch.from_numpy(np.unpackbits(packed, axis=-1, count=width).astype(bool))
+def dequantise(name: str, steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Invert `quantise`."""
+    values = torch.from_numpy(steps.astype(np.float32))
+    return values.mul_(math.pi / ANGLE_STEPS) if name == "aolp" else values.div_(FRACTION_STEPS)
 
 
 @dataclass(frozen=True)
 class Contents:
-    """The sequences of a store of scenes or frames, and the values that it is made from.
-
-    >>> from polarnet.storage import Contents
-    >>> Contents({"lake-00": "train", "road-00": "test"}, {"seed": 1}).splits["road-00"]
-    'test'
-    """
+    """The sequences of a store of scenes or frames, and the values that it is made from."""
 
     splits: Mapping[str, str]
     """Split (train, val or test) of each sequence, in the store's order."""
@@ -107,34 +91,11 @@ class Contents:
 
 
 class SplitStore(Store):
-    """A store whose sequences are each in the split train, val or test; a masked one has a column `valid` as well."""
+    """A store of `Contents`, whose fields are its attributes; a masked one has a column `valid` as well."""
 
-    COLUMNS: ClassVar[Mapping[str, str]]
     splits: dict[str, str]
-    """Split of each sequence."""
     variant_of: dict[str, str]
-    """Name of the original picture, for each sequence whose scene is a variant."""
     masked: bool
-    """Whether the store marks pixels whose light is unknown."""
-
-    @functools.cached_property
-    def columns(self) -> Mapping[str, str]:
-        """Type of each array of a part, by name."""
-        return {name: dtype for name, dtype in self.COLUMNS.items() if self.masked or name != "valid"}
-
-    @classmethod
-    def create_split(cls: type[T], path: str | os.PathLike[str], contents: Contents, **metadata: Any) -> T:
-        """`create_parts` for these contents."""
-        return cls.create_parts(
-            path,
-            list(contents.splits),
-            contents.attributes,
-            contents.sequences_per_part,
-            splits=dict(contents.splits),
-            variant_of=dict(contents.variant_of),
-            masked=contents.masked,
-            **metadata,
-        )
 
     def of_split(self, split: str) -> list[str]:
         """The sequences of `train`, `val` or `test`, in the store's order; ValueError for another split."""
@@ -146,13 +107,13 @@ class SplitStore(Store):
         """The original picture of a sequence or variant; the sequence itself if the store names no pictures."""
         return self.variant_of.get(sequence) or self.attributes.get("scenes", {}).get(sequence, sequence)
 
-    def checked_mask(self, valid: Bool[Array, "*shape"] | None, shape: Sequence[int]) -> Bool[Tensor, "*shape"]:
-        """The mask of a masked store, all pixels valid if it is None; ValueError for another shape or store."""
+    def checked_mask(self, valid: Bool[Array, "*shape"] | None, shape: Sequence[int]) -> Bool[np.ndarray, "*shape"]:
+        """The mask, all pixels valid if it is None; ValueError for another shape, or a mask for a store without one."""
         if valid is None:
-            return torch.ones(tuple(shape), dtype=torch.bool)
+            return np.ones(tuple(shape), bool)
         if not self.masked:
             raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
-        return mask_of("valid", valid, shape).cpu()
+        return mask_of("valid", valid, shape).cpu().numpy()
 
 
 class FrameStore(SplitStore):
@@ -169,7 +130,6 @@ class FrameStore(SplitStore):
 
     FORMAT = "polarnet.frames"
     VERSION = 6
-    COLUMNS: ClassVar[Mapping[str, str]] = {"intensity": "uint16", "dolp": "uint16", "aolp": "uint16", "valid": "uint8"}
     n_frames: int
     """Maximum number of frames of a sequence."""
     height: int
@@ -185,7 +145,8 @@ class FrameStore(SplitStore):
         cls, path: str | os.PathLike[str], contents: Contents, n_frames: int, height: int, width: int
     ) -> "FrameStore":
         """Create a store for up to `n_frames` per sequence, or resume it; see `Store.create_parts`."""
-        return cls.create_split(path, contents, n_frames=n_frames, height=height, width=width, conventions=CONVENTIONS)
+        size: dict[str, Any] = {"n_frames": n_frames, "height": height, "width": width}
+        return cls.create_parts(path, list(contents.splits), **vars(contents), **size, conventions=CONVENTIONS)
 
     def write(
         self,
@@ -196,61 +157,41 @@ class FrameStore(SplitStore):
         aolp: Float[Array, "n h w"],
         valid: Bool[Array, "n h w"] | None = None,
     ) -> None:
-        """Write the frames of the next sequence of a part; a sequence that is already written stays unchanged.
+        """Write the frames of the next sequence of a part; see `Store.append`.
 
         Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
         finite, integer intensities, wrong shapes, times that do not increase, or a mask in a store without one. A mask
         of None marks all pixels valid.
         """
-        t_us = self._checked_times(t_us)
-        for name, frames, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
-            check_shape(name, as_tensor(name, frames), f"{len(t_us)} {channels}{self.height} {self.width}")
-        known = self.checked_mask(valid, dolp.shape)
-        columns = {
-            "intensity": quantise_fraction(intensity, "intensity"),
-            "dolp": quantise_fraction(dolp, "dolp"),
-            "aolp": quantise_angle(aolp, "aolp"),
-            "valid": np.packbits(known.numpy(), axis=-1),
-        }
-        if not self.is_written(sequence):
-            self.append(sequence, columns, {"t_us": t_us.tolist()})
-
-    def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
-        """Times of a sequence's frames, in microseconds from its start."""
-        return torch.tensor(self.record(sequence)["t_us"], dtype=torch.int64)
-
-    def intensity(self, sequence: str) -> Float[Tensor, "n 4 h w"]:
-        """Intensities behind the polarizers at 0, 45, 90 and 135 degrees."""
-        return dequantise_fraction(self.read_column("intensity", sequence))
-
-    def dolp(self, sequence: str) -> Float[Tensor, "n h w"]:
-        """Degree of linear polarization, [0, 1]."""
-        return dequantise_fraction(self.read_column("dolp", sequence))
-
-    def aolp(self, sequence: str) -> Float[Tensor, "n h w"]:
-        """Angle of linear polarization in radians, [0, pi)."""
-        return dequantise_angle(self.read_column("aolp", sequence))
-
-    def valid(self, sequence: str) -> Bool[Tensor, "n h w"] | None:
-        """Where the truth is known; None: everywhere."""
-        return unpack_mask(self.read_column("valid", sequence), self.width) if self.masked else None
-
-    def frames(self, sequence: str, start: int = 0, stop: int | None = None) -> Frames:
-        """Frames of a sequence from number `start` up to `stop` (None: the end)."""
-        values = self.read_columns(sequence, [(name, start, stop) for name in self.columns])
-        intensity, dolp, aolp, *packed = values
-        return Frames(
-            self.t_us(sequence)[start:stop],
-            dequantise_fraction(intensity),
-            dequantise_fraction(dolp),
-            dequantise_angle(aolp),
-            unpack_mask(packed[0], self.width) if packed else None,
-        )
-
-    def _checked_times(self, t_us: Integer[Array, " n"]) -> Int64[Tensor, " n"]:
         times = whole_numbers("t_us", t_us)
         if times.ndim != 1 or not 0 < len(times) <= self.n_frames or (times < 0).any() or (times.diff() <= 0).any():
             raise ValueError(
                 f"expected 1 to {self.n_frames} frame times, increasing from 0 or later, got {times.tolist()[:40]}"
             )
-        return times
+        columns = {}
+        for name, values, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
+            columns[name] = quantise(name, values, f"{len(times)} {channels}{self.height} {self.width}")
+        known = self.checked_mask(valid, dolp.shape)
+        if self.masked:
+            columns["valid"] = np.packbits(known, axis=-1)
+        self.append(sequence, columns, {"t_us": times.tolist()})
+
+    def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
+        """Times of a sequence's frames, in microseconds from its start."""
+        return torch.tensor(self.record(sequence)["t_us"], dtype=torch.int64)
+
+    def quantity(self, name: str, sequence: str) -> Tensor:
+        """`intensity`, `dolp`, `aolp` or, in a masked store, `valid` of all frames of a sequence, as in `Frames`."""
+        return self._values(name, self.read_column(name, sequence))
+
+    def frames(self, sequence: str, start: int = 0, stop: int | None = None) -> Frames:
+        """Frames of a sequence from number `start` up to `stop` (None: the end)."""
+        names = ["intensity", "dolp", "aolp", *["valid"] * self.masked]
+        (columns,) = self.read_columns(sequence, names, [(start, stop)])
+        values = {name: self._values(name, rows) for name, rows in columns.items()}
+        return Frames(self.t_us(sequence)[start:stop], **values)
+
+    def _values(self, name: str, rows: np.ndarray) -> Tensor:
+        if name == "valid":
+            return torch.from_numpy(np.unpackbits(rows, axis=-1, count=self.width).astype(bool))
+        return dequantise(name, rows)

@@ -4,6 +4,7 @@ import errno
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 import numpy as np
@@ -65,20 +66,23 @@ class GrowingColumns:
     group appears with the first block.
     """
 
-    def __init__(self, path: Path, chunk: int, sharded: bool, conventions: Mapping[str, str]):
+    def __init__(self, path: Path, chunk: int, sharded: bool, conventions: Mapping[str, str] = MappingProxyType({})):
         """`chunk` is the number of rows that are compressed together; `conventions` explain the columns to readers."""
         self.path = path
         self._chunk, self._sharded, self._conventions = chunk, sharded, conventions
         self._group: zarr.Group | None = None
         self._arrays: dict[str, zarr.Array] = {}
         self._waiting: dict[str, list[np.ndarray]] = {}
+        self._rows = 0  # that wait
 
     def append(self, rows: Mapping[str, np.ndarray]) -> None:
         """Add rows to every column."""
         for name, values in rows.items():
             self._waiting.setdefault(name, []).append(values)
-        block = self._block()
-        while self._waiting_rows() >= block:
+        self._rows += len(next(iter(rows.values())))
+        row_bytes = sum(values.itemsize * int(np.prod(values.shape[1:])) for values in rows.values())
+        block = self._chunk * (max(1, SHARD_BYTES // (row_bytes * self._chunk)) if self._sharded else 1)
+        while self._rows >= block:
             self._write(block)
 
     def add(self, row: Mapping[str, np.ndarray]) -> None:
@@ -87,15 +91,8 @@ class GrowingColumns:
 
     def flush(self) -> None:
         """Write the rows that are still in memory."""
-        if self._waiting_rows() or (self._waiting and self._group is None):
-            self._write(self._waiting_rows())
-
-    def _waiting_rows(self) -> int:
-        return sum(map(len, next(iter(self._waiting.values()), [])))
-
-    def _block(self) -> int:
-        row_bytes = sum(values.itemsize * int(np.prod(values.shape[1:])) for values, *_ in self._waiting.values())
-        return self._chunk * (max(1, SHARD_BYTES // (row_bytes * self._chunk)) if self._sharded else 1)
+        if self._rows or (self._waiting and self._group is None):
+            self._write(self._rows)
 
     def _write(self, rows: int) -> None:
         """Write the first `rows` waiting rows; the first call also makes the group and its arrays."""
@@ -109,6 +106,7 @@ class GrowingColumns:
             self._arrays[name].append(values[:rows])
             rest = values[rows:]
             self._waiting[name] = [rest if len(rest) > rows else rest.copy()]  # a view would hold all of `values`
+        self._rows -= rows
 
     def _array(self, group: zarr.Group, name: str, values: np.ndarray, rows: int) -> zarr.Array:
         shape = values.shape[1:]

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -55,18 +55,16 @@ def write_panel(folder: Path, panel: Panel, rows: Sequence[str] | None = None) -
     """Write the panel as SEQUENCE.npz, with the predictions of `rows` (None: of all)."""
     names = [*panel.predictions] if rows is None else [*rows]
     shown = [panel.truth, *(panel.predictions[name] for name in names)]
-    aolp = [one.aolp for one in shown if one.aolp is not None]
-    film_aolp = [one.film_aolp for one in shown if one.film_aolp is not None]
+    arrays: dict[str, Any] = {}
+    for name, maps in zip(Shown._fields, zip(*shown, strict=True), strict=True):
+        arrays[name] = torch.stack([one for one in maps if one is not None]).numpy()
     np.savez_compressed(
         folder / f"{panel.sequence}.npz",
         window=np.int64(panel.window),
         t_us=np.int64(panel.t_us),
         rows=np.array(names, dtype=np.str_),
         with_aolp=np.array([one.aolp is not None for one in shown]),
-        dolp=torch.stack([one.dolp for one in shown]).numpy(),
-        aolp=torch.stack(aolp).numpy(),
-        film_dolp=torch.stack([one.film_dolp for one in shown]).numpy(),
-        film_aolp=torch.stack(film_aolp).numpy(),
+        **arrays,
         **{name: getattr(panel, name).numpy() for name in MAPS},
     )
 
@@ -74,16 +72,14 @@ def write_panel(folder: Path, panel: Panel, rows: Sequence[str] | None = None) -
 def read_panel(path: Path) -> Panel:
     """Read a file of `write_panel`."""
     with np.load(path) as file:
-        columns = dict(file)
-    names, with_aolp = columns.pop("rows").tolist(), columns["with_aolp"].tolist()
-    maps = {name: torch.from_numpy(column) for name, column in columns.items()}
+        names, with_aolp = file["rows"].tolist(), file["with_aolp"].tolist()
+        maps = {name: torch.from_numpy(file[name]) for name in ("window", "t_us", *Shown._fields, *MAPS)}
     aolp, film_aolp = iter(maps["aolp"]), iter(maps["film_aolp"])
     truth, *predictions = (
         Shown(dolp, next(aolp) if angled else None, film_dolp, next(film_aolp) if angled else None)
         for dolp, film_dolp, angled in zip(maps["dolp"], maps["film_dolp"], with_aolp, strict=True)
     )
-    window, t_us = int(maps["window"]), int(maps["t_us"])
-    by_row = dict(zip(names, predictions, strict=True))
+    window, t_us, by_row = int(maps["window"]), int(maps["t_us"]), dict(zip(names, predictions, strict=True))
     return Panel(path.stem, window, t_us, **{name: maps[name] for name in MAPS}, truth=truth, predictions=by_row)
 
 

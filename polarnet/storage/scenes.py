@@ -5,25 +5,15 @@ Rendering starts from the stored, quantised scene, so that truth and events agre
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
-from polarnet.runtime.arrays import Array, as_tensor, check_same_shape, check_shape
-from polarnet.storage.frames import (
-    Contents,
-    SplitStore,
-    dequantise_angle,
-    dequantise_fraction,
-    quantise_angle,
-    quantise_fraction,
-)
+from polarnet.runtime.arrays import Array, as_tensor, check_same_shape
+from polarnet.storage.frames import Contents, Polarization, SplitStore, dequantise, quantise
 
-CHUNK = 2**18  # pixels
-
+PLANES = ("s0", "dolp", "aolp")
 CONVENTIONS = {
     "s0": "intensity of a scene, row by row: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
@@ -34,50 +24,17 @@ CONVENTIONS = {
     "duration_us": "length of a sequence in microseconds",
 }
 
-QUANTISERS = {
-    "s0": (quantise_fraction, dequantise_fraction),
-    "dolp": (quantise_fraction, dequantise_fraction),
-    "aolp": (quantise_angle, dequantise_angle),
-}
-
-
-class SceneRecord(NamedTuple):
-    """One sequence, ready to be rendered."""
-
-    name: str
-    scene: str
-    """Name of the scene; several sequences may show one."""
-    s0: Float[Tensor, "h w"]
-    dolp: Float[Tensor, "h w"]
-    aolp: Float[Tensor, "h w"]
-    trajectory: Float64[Tensor, " k"]
-    duration_us: int
-    valid: Bool[Tensor, "h w"] | None = None
-    """Where the light is known; None: everywhere."""
-
-
-class Scene(NamedTuple):
-    """Polarization over an area larger than the sensor."""
-
-    s0: Float[Tensor, "h w"]
-    dolp: Float[Tensor, "h w"]
-    aolp: Float[Tensor, "h w"]
-    valid: Bool[Tensor, "h w"] | None = None
-    """Where the light is known; None: everywhere."""
-
 
 class SceneStore(SplitStore):
-    """Scenes and the sequences that move over them; see `create` and `open`.
-
-    A part holds the scenes of its sequences, each once.
+    """The scene of each sequence, and how the sensor moves over it; see `create` and `open`.
 
     >>> import numpy as np
     >>> import torch
     >>> from polarnet.storage import Contents, SceneStore
-    >>> from polarnet.storage.scenes import Scene
+    >>> from polarnet.storage.frames import Polarization
     >>> sizes = {"largest_picture": (12, 18), "sensor": (6, 9), "trajectory_names": ["x"]}
     >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, **sizes)
-    >>> store.write("lake-00", Scene(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
+    >>> store.write("lake-00", Polarization(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
     >>> store.finish()
     >>> SceneStore.open("scenes.zarr").read("lake-00").s0.shape
     torch.Size([12, 18])
@@ -85,19 +42,14 @@ class SceneStore(SplitStore):
 
     FORMAT = "polarnet.scenes"
     VERSION = 6
-    COLUMNS: ClassVar[Mapping[str, str]] = {"s0": "uint16", "dolp": "uint16", "aolp": "uint16", "valid": "uint8"}
+    chunk = 2**18  # pixels
     scene_of: dict[str, str]
-    """Name of the scene of each sequence."""
+    """Name of the scene of each sequence; several sequences may show one."""
     largest_picture: list[int]
     """Height and width that no scene exceeds, pixels."""
     sensor_height: int
     sensor_width: int
     trajectory_names: list[str]
-
-    @property
-    def chunk(self) -> int:
-        """Pixels that are compressed together."""
-        return CHUNK
 
     @classmethod
     def create(
@@ -115,14 +67,18 @@ class SceneStore(SplitStore):
         `scene_of` maps each sequence to the name of its scene. `largest_picture` and `sensor` are (height, width) in
         pixels. ValueError if two sequences of one picture or its variants are in different splits.
         """
-        if scene_of.keys() != contents.splits.keys():
-            raise ValueError(
-                f"expected a scene for each of {len(contents.splits)} sequences, got {len(scene_of)} scenes"
-            )
-        _check_no_leak({**scene_of, **contents.variant_of}, contents.splits)
-        return cls.create_split(
+        split_of: dict[str, str] = {}
+        for sequence, picture in {**scene_of, **contents.variant_of}.items():
+            split = contents.splits[sequence]
+            if split_of.setdefault(picture, split) != split:
+                raise ValueError(
+                    f"picture {picture} would be in the splits {split_of[picture]} and {split}; put all sequences of "
+                    "a picture and its variants in one"
+                )
+        return cls.create_parts(
             path,
-            contents,
+            list(contents.splits),
+            **vars(contents),
             scene_of=dict(scene_of),
             largest_picture=list(largest_picture),
             sensor_height=sensor[0],
@@ -131,10 +87,8 @@ class SceneStore(SplitStore):
             conventions=CONVENTIONS,
         )
 
-    def write(self, sequence: str, scene: Scene, trajectory: Float64[Array, " k"], duration_us: int) -> None:
+    def write(self, sequence: str, scene: Polarization, trajectory: Float64[Array, " k"], duration_us: int) -> None:
         """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
-
-        A sequence that is already written stays unchanged. Sequences over one scene share its pixels in a part.
 
         Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
         finite, integers, planes of different shapes, a scene of an impossible size, or a mask in a store without one.
@@ -144,67 +98,45 @@ class SceneStore(SplitStore):
             raise ValueError(f"{sequence}: expected {len(names)} finite numbers ({', '.join(names)}), got {trajectory}")
         if duration_us <= 0:
             raise ValueError(f"{sequence}: expected a duration above 0 us, got {duration_us}")
-        if self.is_written(sequence):
-            return
         record = {
             "trajectory": trajectory.tolist(),
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
-        name, names = self.scene_of[sequence], self.parts[self.part_of(sequence)]
-        same = next((other for other in names[: names.index(sequence)] if self.scene_of[other] == name), None)
-        self.append(sequence, {} if same else self._pixels(name, scene), record, rows_of=same)
+        self.append(sequence, self._pixels(sequence, scene), record)
 
-    def read(self, sequence: str) -> SceneRecord:
-        """Scene, trajectory and duration of a sequence; ValueError names the column of damaged data."""
-        record, requests = self.record(sequence), [(name, 0, None) for name in self.columns]
-        s0, dolp, aolp, *mask = (rows.reshape(record["picture_size"]) for rows in self.read_columns(sequence, requests))
-        scene = _dequantised([s0, dolp, aolp], torch.from_numpy(mask[0] == 1) if mask else None)
-        trajectory = torch.tensor(record["trajectory"], dtype=torch.float64)
-        name, duration_us = self.scene_of[sequence], record["duration_us"]
-        return SceneRecord(sequence, name, *scene[:3], trajectory, duration_us, scene.valid)
+    def read(self, sequence: str) -> Polarization:
+        """Scene of a sequence; ValueError names the column of damaged data."""
+        size = self.record(sequence)["picture_size"]
+        (columns,) = self.read_columns(sequence, [*PLANES, *["valid"] * self.masked])
+        planes = {name: dequantise(name, columns[name].reshape(size)) for name in PLANES}
+        valid = torch.from_numpy(columns["valid"].reshape(size) == 1) if self.masked else None
+        return Polarization(**planes, valid=valid)
+
+    def trajectory(self, sequence: str) -> Float64[np.ndarray, " k"]:
+        """How the sensor moves: the numbers that `trajectory_names` names."""
+        return np.array(self.record(sequence)["trajectory"], np.float64)
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
         return self.record(sequence)["duration_us"]
 
-    def _pixels(self, name: str, scene: Scene) -> dict[str, np.ndarray]:
+    def _pixels(self, name: str, scene: Polarization) -> dict[str, np.ndarray]:
         """The columns of a scene; ValueError for a scene that the store cannot hold."""
-        planes = {plane: as_tensor(plane, getattr(scene, plane)) for plane in QUANTISERS}
-        for plane, values in planes.items():
-            check_shape(plane, values, "height width")
+        planes = {plane: as_tensor(plane, getattr(scene, plane)) for plane in PLANES}
         check_same_shape(planes)
-        size = tuple(scene.s0.shape)
-        height, width = self.largest_picture
+        columns = {plane: quantise(plane, values, "height width").ravel() for plane, values in planes.items()}
+        size, (height, width) = tuple(scene.s0.shape), self.largest_picture
         if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
             raise ValueError(
                 f"{name}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
                 f"{height}x{width} px, got {size[0]}x{size[1]}"
             )
-        columns = dict(zip(QUANTISERS, _quantised(scene), strict=True))
-        columns["valid"] = self.checked_mask(scene.valid, size).numpy().astype(np.uint8)
-        return {column: values.ravel() for column, values in columns.items()}
+        known = self.checked_mask(scene.valid, size)
+        return columns | ({"valid": known.astype(np.uint8).ravel()} if self.masked else {})
 
 
-def as_stored(scene: Scene) -> Scene:
+def as_stored(scene: Polarization) -> Polarization:
     """The scene as a store gives it back, quantised."""
-    return _dequantised(_quantised(scene), scene.valid)
-
-
-def _quantised(scene: Scene) -> list[np.ndarray]:
-    return [quantise(getattr(scene, plane), plane) for plane, (quantise, _) in QUANTISERS.items()]
-
-
-def _dequantised(planes: Sequence[np.ndarray], valid: Tensor | None) -> Scene:
-    s0, dolp, aolp = (dequantise(steps) for steps, (_, dequantise) in zip(planes, QUANTISERS.values(), strict=True))
-    return Scene(s0, dolp, aolp, valid)
-
-
-def _check_no_leak(pictures: Mapping[str, str], splits: Mapping[str, str]) -> None:
-    split_of: dict[str, str] = {}
-    for sequence, picture in pictures.items():
-        if split_of.setdefault(picture, splits[sequence]) != splits[sequence]:
-            raise ValueError(
-                f"picture {picture} would be in the splits {split_of[picture]} and {splits[sequence]}; "
-                "put all sequences of a picture and its variants in one"
-            )
+    planes = {plane: dequantise(plane, quantise(plane, getattr(scene, plane))) for plane in PLANES}
+    return Polarization(**planes, valid=scene.valid)

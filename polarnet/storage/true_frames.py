@@ -4,35 +4,19 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import zarr
-from jaxtyping import Bool, Float, Int64
-from torch import Tensor
+from jaxtyping import Int64
 
-from polarnet.storage.frames import FRAMES_PER_CHUNK, FrameStore, dequantise_angle, dequantise_fraction
+from polarnet.storage.frames import FRAMES_PER_CHUNK, FrameStore, Polarization, dequantise
 from polarnet.storage.groups import open_group
 
 APPENDED = "truth.zarr"
 """Name of the frames that `polarnet simulate` writes beside its event store."""
 STORED = "frames.zarr"
 """Name of the frame store that the pipeline writes beside its event store."""
-
-
 MAPS = ("s0", "dolp", "aolp")
-
-
-class TrueFrame(NamedTuple):
-    """True polarization on the sensor at one time."""
-
-    s0: Float[Tensor, "h w"]
-    """In [0, 1]."""
-    dolp: Float[Tensor, "h w"]
-    aolp: Float[Tensor, "h w"]
-    """Radians in [0, pi)."""
-    valid: Bool[Tensor, "h w"] | None = None
-    """Where the truth is known; None: everywhere."""
 
 
 class TrueFrames:
@@ -41,7 +25,7 @@ class TrueFrames:
     `t_us` are their times in microseconds from the start of the sequence; `frames[k]` is the frame at `t_us[k]`.
     """
 
-    def __init__(self, t_us: Int64[np.ndarray, " n"], block: Callable[[int, int], list[TrueFrame]]):
+    def __init__(self, t_us: Int64[np.ndarray, " n"], block: Callable[[int, int], list[Polarization]]):
         """`block(start, stop)` reads the frames from number `start` up to `stop`."""
         self.t_us = t_us
         self._block = functools.lru_cache(maxsize=2)(block)
@@ -49,7 +33,7 @@ class TrueFrames:
     def __len__(self) -> int:
         return len(self.t_us)
 
-    def __getitem__(self, number: int) -> TrueFrame:
+    def __getitem__(self, number: int) -> Polarization:
         first = number - number % FRAMES_PER_CHUNK
         return self._block(first, min(first + FRAMES_PER_CHUNK, len(self)))[number - first]
 
@@ -57,7 +41,7 @@ class TrueFrames:
         """Whether there is a frame at a time, give or take `within_us`."""
         return bool((np.abs(self.t_us - t_us) <= within_us).any())
 
-    def at(self, t_us: int) -> TrueFrame:
+    def at(self, t_us: int) -> Polarization:
         """The frame closest to a time."""
         return self[int(np.abs(self.t_us - t_us).argmin())]
 
@@ -80,28 +64,20 @@ def open_truth(path: str | os.PathLike[str], sequence: str) -> TrueFrames:
     torch.Size([12, 18])
     """
     group = open_group(path)
-    if group.attrs.get("format") != FrameStore.FORMAT:
-        return _appended(group)
-    store = FrameStore.open(path)
-    return _stored(store, sequence)
+    if group.attrs.get("format") == FrameStore.FORMAT:
+        store = FrameStore.open(path)
 
+        def stored(start: int, stop: int) -> list[Polarization]:
+            _, intensity, dolp, aolp, valid = store.frames(sequence, start, stop)
+            i0, _, i90, _ = intensity.unbind(1)
+            return [*map(Polarization, i0 + i90, dolp, aolp, [None] * len(dolp) if valid is None else valid)]
 
-def _appended(group: zarr.Group) -> TrueFrames:
+        return TrueFrames(store.t_us(sequence).numpy(), stored)
     arrays: dict[str, Any] = dict(group.arrays())
     if missing := {"t_us", *MAPS} - arrays.keys():
         raise ValueError(f"{group.store_path}: expected true frames, {', '.join(sorted(missing))} is missing")
 
-    def block(start: int, stop: int) -> list[TrueFrame]:
-        s0, dolp, aolp = (np.asarray(arrays[name][start:stop]) for name in MAPS)
-        return [*map(TrueFrame, dequantise_fraction(s0), dequantise_fraction(dolp), dequantise_angle(aolp))]
+    def appended(start: int, stop: int) -> list[Polarization]:
+        return [*map(Polarization, *(dequantise(name, np.asarray(arrays[name][start:stop])) for name in MAPS))]
 
-    return TrueFrames(np.asarray(arrays["t_us"][:]), block)
-
-
-def _stored(store: FrameStore, sequence: str) -> TrueFrames:
-    def block(start: int, stop: int) -> list[TrueFrame]:
-        _, intensity, dolp, aolp, valid = store.frames(sequence, start, stop)
-        i0, _, i90, _ = intensity.unbind(1)
-        return [*map(TrueFrame, i0 + i90, dolp, aolp, [None] * len(dolp) if valid is None else valid)]
-
-    return TrueFrames(store.t_us(sequence).numpy(), block)
+    return TrueFrames(np.asarray(arrays["t_us"][:]), appended)

@@ -67,6 +67,7 @@ def test_windows_twice_as_long_are_half_as_many_with_twice_the_events(simulated,
 def test_truth_at_any_time_lies_between_that_of_the_frames(simulated):
     scenes, frames = SceneStore.open(simulated.scenes), FrameStore.open(simulated.frames)
     t_us = frames.t_us("a-0")
-    torch.testing.assert_close(sequence_at(scenes, "a-0", [], t_us).dolp, frames.dolp("a-0")[1:], atol=1e-5, rtol=0)
+    result = sequence_at(scenes, "a-0", [], t_us)
+    torch.testing.assert_close(result.dolp, frames.frames("a-0", 1).dolp, atol=1e-5, rtol=0)
     finer = sequence_at(scenes, "a-0", [], torch.arange(0, int(t_us[-1]) + 1, 5000))
     assert len(finer.dolp) == int(t_us[-1]) // 5000

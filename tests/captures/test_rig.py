@@ -91,7 +91,7 @@ def test_the_ground_truth_is_the_scenes_own(calibrated, config):
     t_us = store.t_us("one").numpy()
     assert len(t_us) >= 8
     expected = true_dolp(truth, t_us + round(zero_us), config)
-    assert float((store.dolp("one") - expected).pow(2).mean().sqrt()) < 0.01
+    assert float((store.frames("one").dolp - expected).pow(2).mean().sqrt()) < 0.01
     assert float(expected.std()) > 0.05
 
 

@@ -7,15 +7,10 @@ from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotati
 
 
 def test_a_steady_polarizer_turns_by_a_quarter_in_a_quarter_of_its_period():
-    rotation = steady_rotation(2.0, math.radians(20))
+    rotation, back = steady_rotation(2.0, math.radians(20)), steady_rotation(-1.0)
     assert np.degrees(rotation.at(np.array([0, 125_000, 1_125_000]))) == pytest.approx([20, 110, 830])
-    assert rotation.half_turn_us == 250_000
-
-
-def test_a_negative_rate_turns_the_other_way():
-    rotation = steady_rotation(-1.0)
-    assert np.degrees(rotation.at(np.array([250_000]))) == pytest.approx([-90])
-    assert (rotation.rate_hz, rotation.half_turn_us) == (-1.0, 500_000)
+    assert np.degrees(back.at(np.array([250_000]))) == pytest.approx([-90])
+    assert (rotation.half_turn_us, back.rate_hz, back.half_turn_us) == (250_000, -1.0, 500_000)
 
 
 def test_triggers_follow_an_uneven_rotation_and_the_last_rate_goes_on():

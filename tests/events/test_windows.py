@@ -48,9 +48,9 @@ def test_an_item_is_a_whole_sequence_with_the_truth_at_each_windows_end(stores):
     item = WindowDataset(events, frames, ["b", "a"], event_tensor)[0]
     assert item.name == "b"
     assert item.inputs.shape == (3, 4, HEIGHT, WIDTH)
-    assert torch.equal(item.dolp, frames.dolp("b")[1:])
-    assert torch.equal(item.aolp, frames.aolp("b")[1:])
-    assert torch.equal(item.intensity, frames.intensity("b")[1:])
+    assert torch.equal(item.dolp, frames.frames("b", 1).dolp)
+    assert torch.equal(item.aolp, frames.frames("b", 1).aolp)
+    assert torch.equal(item.intensity, frames.frames("b", 1).intensity)
 
 
 def test_inputs_are_the_representation_of_each_window_of_each_polarizer(stores):

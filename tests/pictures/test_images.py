@@ -26,6 +26,8 @@ from polarnet.pictures.images import (
     write_png,
 )
 
+SRGB, LAB = (ImageCms.ImageCmsProfile(ImageCms.createProfile(space)).tobytes() for space in ("sRGB", "LAB"))
+
 
 @pytest.fixture
 def rgb8() -> np.ndarray:
@@ -35,10 +37,6 @@ def rgb8() -> np.ndarray:
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """sRGB code values of linear light in [0, 1] (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def srgb_from_profile(rgb: np.ndarray, profile: bytes) -> np.ndarray:
-    return srgb_of(rgb, Picture(rgb, profile, "", None, None, None))
 
 
 def reason(path: Path) -> str:
@@ -171,83 +169,6 @@ def test_extensions_name_pictures_and_not_openimageio_s_other_formats():
     assert not {"null", "term", "z", "env", "txt", "csv"} & extensions
 
 
-# -- colour profiles ---------------------------------------------------------------------------------------------------
-
-BRADFORD_PRIMARIES = {  # columns of the D50 matrices: published in the profiles of these spaces
-    "display_p3": [(0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)],
-    "prophoto": [(0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491)],
-    "adobe": [(0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457)],
-    "srgb": [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)],
-}
-GAMMA_TABLE = struct.pack(">4s4xI", b"curv", 256) + struct.pack(
-    ">256H", *(round(65535 * (i / 255) ** 1.8) for i in range(256))
-)
-CURVES = {
-    "gamma": struct.pack(">4s4xIH2x", b"curv", 1, round(2.2 * 256)),
-    "identity": struct.pack(">4s4xI", b"curv", 0),
-    "table": GAMMA_TABLE,
-    "para0": struct.pack(">4s4xH2xi", b"para", 0, round(1.8 * 65536)),
-    "para3": struct.pack(
-        ">4s4xH2x5i", b"para", 3, *(round(65536 * x) for x in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))
-    ),
-}
-
-
-def fixed(*numbers: float) -> bytes:
-    return struct.pack(f">{len(numbers)}i", *(round(65536 * x) for x in numbers))
-
-
-def icc(space: bytes, connection: bytes, version: int, elements: dict[bytes, bytes]) -> bytes:
-    """A profile laid out as ICC.1 section 7 says."""
-    white = fixed(0.9642, 1.0, 0.8249)
-    elements = {
-        b"desc": struct.pack(">4s4xI5s79x", b"desc", 5, b"test\0"),
-        b"cprt": struct.pack(">4s4x5s3x", b"text", b"none\0"),
-        b"wtpt": b"XYZ \0\0\0\0" + white,
-        **elements,
-    }
-    table, data, offset = b"", b"", 132 + 12 * len(elements)
-    for tag, element in elements.items():
-        table += struct.pack(">4sII", tag, offset + len(data), len(element))
-        data += element + bytes(-len(element) % 4)
-    header = struct.pack(">I4xI4s4s4s12x4s28x", offset + len(data), version, b"mntr", space, connection, b"acsp")
-    return header + white + bytes(48) + struct.pack(">I", len(elements)) + table + data
-
-
-def matrix_profile(primaries: str, curve: str, space: bytes = b"RGB ") -> bytes:
-    columns = zip((b"rXYZ", b"gXYZ", b"bXYZ"), BRADFORD_PRIMARIES[primaries], strict=True)
-    elements = {tag: b"XYZ \0\0\0\0" + fixed(*column) for tag, column in columns}
-    curves = dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), CURVES[curve])
-    return icc(space, b"XYZ ", 0x04000000 if curve.startswith("para") else 0x02100000, elements | curves)
-
-
-def table_profile_that_swaps_red_and_blue() -> bytes:
-    """A 2x2x2 table (type mft2): each corner of the cube has the CIELAB value of sRGB with red and blue swapped."""
-    lab = {
-        (0, 0, 0): (0.0, 0.0, 0.0),
-        (1, 0, 0): (54.29, 80.80, 69.89),
-        (0, 1, 0): (87.82, -79.27, 80.99),
-        (0, 0, 1): (29.57, 68.30, -112.03),
-        (1, 1, 0): (97.61, -15.75, 93.39),
-        (0, 1, 1): (90.67, -50.66, -14.96),
-        (1, 0, 1): (60.17, 93.54, -60.50),
-        (1, 1, 1): (100.0, 0.0, 0.0),
-    }
-    corners = [lab[b, g, r] for r in (0, 1) for g in (0, 1) for b in (0, 1)]
-    grid = b"".join(struct.pack(">3H", round(x * 652.8), *(round(256 * (c + 128)) for c in ab)) for x, *ab in corners)
-    linear = struct.pack(">2H", 0, 65535) * 3
-    header = b"mft2\0\0\0\0" + bytes([3, 3, 2, 0]) + fixed(1, 0, 0, 0, 1, 0, 0, 0, 1) + struct.pack(">2H", 2, 2)
-    return icc(b"RGB ", b"Lab ", 0x02100000, {b"A2B0": header + linear + grid + linear})
-
-
-@pytest.mark.parametrize(("primaries", "curve"), [("display_p3", "para3"), ("prophoto", "para0"), ("adobe", "table")])
-def test_grey_of_any_profile_stays_grey_and_follows_its_curve(primaries, curve):
-    grey = np.repeat(np.linspace(0, 1, 52, dtype=np.float32)[None, :, None], 3, axis=2)
-    gamma = {"para0": 1.8, "table": 1.8}.get(curve)
-    expected = grey if gamma is None else encode_srgb(grey**gamma)
-    np.testing.assert_allclose(srgb_from_profile(grey, matrix_profile(primaries, curve)), expected, atol=2.5 / 255)
-
-
 def test_a_photograph_in_adobe_rgb_comes_out_as_little_cms_converts_it():
     path = Path(str(resources.files("skimage"))) / "data" / "rocket.jpg"
     stored = Image.open(path)
@@ -258,33 +179,16 @@ def test_a_photograph_in_adobe_rgb_comes_out_as_little_cms_converts_it():
     assert np.abs(got - np.asarray(stored).astype(int)).max() > 10
 
 
-@pytest.mark.parametrize("curve", ["para3", "gamma"])
-def test_an_srgb_profile_keeps_all_16_bits(tmp_path, curve):
+def test_an_srgb_profile_keeps_all_16_bits(tmp_path):
     ramp = np.repeat(np.arange(600, dtype=np.uint16).reshape(20, 30, 1) * 20 + 20000, 3, axis=2)
-    tifffile.imwrite(tmp_path / "deep.tif", ramp, iccprofile=matrix_profile("srgb", curve))
-    values = len(np.unique(read_rgb(tmp_path / "deep.tif")[1]))
-    assert values == 600 if curve == "para3" else values < 80  # another curve converts to 8 bits
+    tifffile.imwrite(tmp_path / "deep.tif", ramp, iccprofile=SRGB)
+    assert len(np.unique(read_rgb(tmp_path / "deep.tif")[1])) == 600
 
 
-def test_a_profile_made_of_tables_is_followed():
-    colours = np.array([[(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (0, 0, 0)]], dtype=np.float32)
-    swapped = srgb_from_profile(colours, table_profile_that_swaps_red_and_blue())
-    np.testing.assert_allclose(swapped, colours[..., ::-1], atol=3 / 255)
-
-
-@pytest.mark.parametrize(
-    "profile",
-    [
-        b"short",
-        matrix_profile("adobe", "gamma", b"CMYK"),
-        matrix_profile("adobe", "gamma").replace(b"gTRC", b"none"),
-        matrix_profile("adobe", "gamma")[:150],
-        table_profile_that_swaps_red_and_blue()[:400],
-    ],
-)
+@pytest.mark.parametrize("profile", [b"short", LAB, SRGB[:150], SRGB.replace(b"gTRC", b"none")])
 def test_a_profile_that_cannot_be_used_is_named(rgb8, profile):
     with pytest.raises(UnreadablePicture, match=r"profile cannot be used .*; convert the file to sRGB"):
-        srgb_from_profile(rgb8.astype(np.float32) / 255, profile)
+        srgb_of(rgb8.astype(np.float32) / 255, Picture(rgb8, profile, "", None, None, None))
 
 
 def test_a_picture_of_billions_of_pixels_and_a_name_of_bytes_are_refused(tmp_path, monkeypatch):

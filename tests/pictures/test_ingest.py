@@ -84,6 +84,17 @@ def test_good_files_come_in_and_bad_ones_are_named(mixed_folder, tmp_path, caplo
         assert f"skipped {skipped.file}: {skipped.reason}" in caplog.messages
     split = {"pictures": 4, "train": 2, "val": 1, "test": 1}
     assert manifest.counts == split | {"skipped": 5, "ignored_files": 1, "unread_files": 0}
+    assert read_manifest(tmp_path / "images") == manifest
+    text = (tmp_path / "images" / "manifest.json").read_text()
+    assert str(tmp_path) not in text  # no place of this machine
+    content = json.loads(text)
+    assert set(content) == {"pictures", "skipped", "counts"}
+    entry = content["pictures"][0]
+    assert (entry["name"], entry["file"]) == (f"deep-{entry['sha256'][:8]}", f"{entry['name']}.png")
+    sizes = ("bits", "height", "width", "source_height", "source_width")
+    assert [entry[size] for size in sizes] == [16, 100, 150, 110, 160]
+    files = [*(entry["file"] for entry in content["pictures"]), "manifest.json", "SHA256SUMS"]
+    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == sorted(files)
 
 
 def test_what_comes_in_is_right(mixed_folder, tmp_path):
@@ -95,23 +106,6 @@ def test_what_comes_in_is_right(mixed_folder, tmp_path):
     assert np.array_equal(deep, photograph(2).astype(np.uint16) * 257)
     turned = pixels_of(tmp_path / "images", manifest, "rotated").astype(int)
     assert np.abs(turned - photograph(4)).mean() < 2
-
-
-def test_the_manifest_says_everything_and_reads_back(mixed_folder, tmp_path):
-    manifest = ingest(dataclasses.replace(CONFIG, root=str(mixed_folder)), 1, tmp_path / "images", map)
-    assert read_manifest(tmp_path / "images") == manifest
-    text = (tmp_path / "images" / "manifest.json").read_text()
-    assert str(tmp_path) not in text  # no place of this machine
-    content = json.loads(text)
-    assert set(content) == {"pictures", "skipped", "counts"}
-    entry = content["pictures"][0]
-    assert entry["name"] == f"deep-{entry['sha256'][:8]}"
-    assert entry["file"] == f"{entry['name']}.png"
-    assert (entry["bits"], entry["height"], entry["width"]) == (16, 100, 150)
-    assert (entry["source_height"], entry["source_width"]) == (110, 160)
-    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == sorted(
-        [entry["file"] for entry in content["pictures"]] + ["manifest.json", "SHA256SUMS"]
-    )
 
 
 def test_a_folder_without_any_usable_picture_is_an_error_that_says_what_was_looked_for(tmp_path):

@@ -201,7 +201,7 @@ def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
     assert sorted(share.values()) == [0, pytest.approx(64 / (40 * 60), abs=1e-6)]
     synthesize(Synthesis(tmp_path / "images", MOTION, 1, 2), tmp_path / "scenes.zarr", tmp_path / "frames.zarr", map)
     scenes, frames = SceneStore.open(tmp_path / "scenes.zarr"), FrameStore.open(tmp_path / "frames.zarr")
-    masked = {name: ~frames.valid(name) for name in frames.sequences}
+    masked = {name: ~frames.frames(name).valid for name in frames.sequences}
     (shown,) = (name for name in masked if masked[name].any())
     assert sum(map(torch.Tensor.any, masked.values())) == 1  # the dark one has a mask too, of nothing
     assert torch.equal(~scenes.read(shown).valid, torch.from_numpy(lamp.min(axis=0) == 255))
@@ -209,7 +209,7 @@ def test_saturated_pixels_stay_masked_down_to_the_frames(tmp_path):
         rows, columns = frame.any(1).sum().item(), frame.any(0).sum().item()
         assert frame.sum().item() == rows * columns
         assert max(rows, columns) <= 9
-    assert frames.dolp(shown)[~masked[shown]].mean().item() == pytest.approx(0.6, abs=0.005)
+    assert frames.frames(shown).dolp[~masked[shown]].mean().item() == pytest.approx(0.6, abs=0.005)
 
 
 def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_path):
@@ -230,8 +230,8 @@ def test_a_measurement_becomes_a_scene_whose_frames_show_its_polarization(tmp_pa
     synthesize(Synthesis(tmp_path / "images", MOTION, 1, 2), tmp_path / "scenes.zarr", tmp_path / "frames.zarr", map)
     frames = FrameStore.open(tmp_path / "frames.zarr")
     assert not frames.masked
-    assert frames.dolp(frames.sequences[0]).mean().item() == pytest.approx(0.6, abs=0.005)
-    assert math.degrees(frames.aolp(frames.sequences[0]).mean()) == pytest.approx(30, abs=0.2)
+    assert frames.frames(frames.sequences[0]).dolp.mean().item() == pytest.approx(0.6, abs=0.005)
+    assert math.degrees(frames.frames(frames.sequences[0]).aolp.mean()) == pytest.approx(30, abs=0.2)
 
 
 @pytest.mark.shared

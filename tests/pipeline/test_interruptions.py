@@ -44,8 +44,8 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     from polarnet.config.tree import load
     from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory
     from polarnet.simulation.scene import polarization_from_rgb
-    from polarnet.storage.frames import Contents
-    from polarnet.storage.scenes import Scene, SceneStore
+    from polarnet.storage.frames import Contents, Polarization
+    from polarnet.storage.scenes import SceneStore
 
     motion: SynthesizeConfig = load(
         project_root, ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.5"]
@@ -63,7 +63,7 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     )
     for number, name in enumerate(names):
         trajectory = random_trajectory(motion, 200, 300, np.random.default_rng(number))
-        vector, scene = torch.from_numpy(trajectory.to_vector()), Scene(*polarization_from_rgb(picture))
+        vector, scene = torch.from_numpy(trajectory.to_vector()), Polarization(*polarization_from_rgb(picture))
         scenes.write(name, scene, vector, round(1e6 * motion.duration_s))
     scenes.finish()
     return folder

@@ -110,6 +110,6 @@ def test_a_simulation_tells_the_camera_that_it_drew():
 def test_the_event_store_holds_what_each_sequence_drew(simulated):
     store = EventStore.open(simulated.events)
     for sequence in store.sequences:
-        values = store.drawn(sequence)["emulate"]
+        values = store.record(sequence)["drawn"]["emulate"]
         assert values.keys() == simulated.camera.sensor.randomise.keys()
         assert values["cutoff_hz"] == simulated.camera.drawn(simulated.seed, sequence).sensor.cutoff_hz

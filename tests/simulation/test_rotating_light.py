@@ -14,8 +14,8 @@ from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import Contents
-from polarnet.storage.scenes import Scene, SceneStore
+from polarnet.storage.frames import Contents, Polarization
+from polarnet.storage.scenes import SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
 STILL = Sine(0.0, 0.0, 0.0)
@@ -102,7 +102,7 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), (STILL,) * 3, STILL, STILL, 10.0)
     maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
     for name in names:
-        store.write(name, Scene(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)
+        store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)
     store.finish()
     arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.rotating, config.camera, config.seed, map
     assert emulate_rotating_scenes(*arguments) == 1

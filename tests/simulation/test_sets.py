@@ -56,7 +56,7 @@ def test_complex_motion_shows_held_out_pictures_alone_turning_and_zooming(images
     frames, events = FrameStore.open(folder / "frames.zarr"), EventStore.open(folder / "events.zarr")
     assert frames.of_split("test") == events.sequences == ["held-out-00"]
     scenes = SceneStore.open(folder / "scenes.zarr")
-    trajectory = Trajectory.from_vector(scenes.read("held-out-00").trajectory.numpy())
+    trajectory = Trajectory.from_vector(scenes.trajectory("held-out-00"))
     assert trajectory.roll.amplitude > 0
     assert trajectory.zoom.amplitude > 0
     assert 40 <= trajectory.speed_px_s <= 60

@@ -121,7 +121,7 @@ def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):
     for sequence in scenes.sequences[:3]:
         record = scenes.read(sequence)
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        trajectory = Trajectory.from_vector(record.trajectory.numpy())
+        trajectory = Trajectory.from_vector(scenes.trajectory(sequence))
         intensity, degree, angle = frames_of(scene, trajectory, t_us, 24, 36)
         stored = frames.frames(sequence)
         assert stored.t_us.tolist() == t_us

@@ -11,7 +11,6 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import MappingProxyType
 
 import fsspec
 import numpy as np
@@ -33,7 +32,6 @@ class Numbers(Store):
     FORMAT = "test.numbers"
     VERSION = 3
     chunk = 1024
-    columns = MappingProxyType({"value": "uint16", "pair": "int64"})
 
 
 class Others(Numbers):
@@ -54,7 +52,7 @@ def values_of(name: str) -> np.ndarray:
 
 
 def columns_of(name: str) -> dict[str, np.ndarray]:
-    return {"value": values_of(name), "pair": np.stack([values_of(name)] * 2, axis=1)}
+    return {"value": values_of(name), "pair": np.stack([values_of(name)] * 2, axis=1).astype(np.int64)}
 
 
 def write(store: Numbers, name: str) -> None:
@@ -100,8 +98,8 @@ def test_rows_are_counted_within_their_sequence(finished):
     store = Numbers.open(finished)
     assert np.array_equal(store.read_column("value", "s3", 2000, 5000), values_of("s3")[2000:5000])
     assert [len(store.read_column("value", name, 5990, 7000)) for name in ("s0", "s2")] == [0, 10]
-    one, pair = store.read_columns("s4", [("value", 11_999, None), ("pair", 0, 1)])
-    assert (len(one), pair.tolist()) == (1, [[values_of("s4")[0]] * 2])
+    first, last = store.read_columns("s4", ["value", "pair"], [(0, 1), (11_999, None)])
+    assert (first["pair"].tolist(), last["value"].tolist()) == ([[values_of("s4")[0]] * 2], [values_of("s4")[-1]])
 
 
 def test_any_zarr_reader_finds_a_sequence_and_each_starts_a_chunk_of_its_own(finished):
@@ -131,14 +129,6 @@ def test_the_order_of_the_parts_and_a_second_start_or_writer_leave_no_trace(fini
     assert files_of(tmp_path / "store.zarr") == files_of(finished)
 
 
-def test_a_part_takes_its_sequences_in_order(tmp_path):
-    store = store_at(tmp_path / "store.zarr")
-    with pytest.raises(ValueError, match="part-00001 takes its sequences in order, expected s2, got s3"):
-        write(store, "s3")
-    write(store, "s2")
-    assert store.missing() == NAMES
-
-
 def test_a_disk_without_room_ends_the_writing_and_a_larger_one_takes_the_missing_parts(finished, tmp_path, monkeypatch):
     usage, free = shutil.disk_usage(tmp_path), 0
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
@@ -152,37 +142,36 @@ def test_a_disk_without_room_ends_the_writing_and_a_larger_one_takes_the_missing
     assert files_of(tmp_path / "store.zarr") == files_of(finished)
 
 
-def test_an_unfinished_store_is_resumed_under_an_equal_header_and_removed_under_another(tmp_path):
-    store = store_at(tmp_path / "store.zarr", seed=1)
-    for name in ("s0", "s2", "s3", "s4"):  # the first part is begun only
-        write(store, name)
-    assert store_at(tmp_path / "store.zarr", seed=1).missing_parts() == ["part-00000"]
-    with pytest.raises(ValueError, match="2 not written yet: s0, s1; write them, then finish"):
-        store_at(tmp_path / "store.zarr", seed=1).finish()
-    assert store_at(tmp_path / "store.zarr", seed=2).missing() == NAMES
-    write(store_at(tmp_path / "store.zarr", seed=2), "s0")
-    assert Numbers.create_parts(tmp_path / "store.zarr", NAMES, {"seed": 2}, 3).missing() == NAMES
-
-
-def test_an_unfinished_store_of_other_code_is_not_resumed_and_a_finished_one_does_not_name_it(
+def test_an_unfinished_store_is_resumed_under_an_equal_header_and_code_and_removed_under_another(
     finished, tmp_path, monkeypatch
 ):
-    write(store_at(tmp_path / "store.zarr"), "s4")
+    path = tmp_path / "store.zarr"
+    store = store_at(path, seed=1)
+    with pytest.raises(ValueError, match="part-00001 takes its sequences in order, expected s2, got s3"):
+        write(store, "s3")
+    for name in ("s0", "s2", "s3", "s4"):  # the first part is begun only
+        write(store, name)
+    assert store_at(path, seed=1).missing_parts() == ["part-00000"]
+    with pytest.raises(ValueError, match="2 not written yet: s0, s1; write them, then finish"):
+        store_at(path, seed=1).finish()
+    assert store_at(path, seed=2).missing() == NAMES
+    assert Numbers.create_parts(path, NAMES, {"seed": 2}, 3).missing() == NAMES
+    write(store_at(path), "s4")
     monkeypatch.setattr(parts_module, "code_digest", lambda: "of an edited polarnet")
-    assert store_at(tmp_path / "store.zarr").missing() == NAMES
-    write_missing_and_finish(tmp_path / "store.zarr")
-    assert files_of(tmp_path / "store.zarr") == files_of(finished)
+    assert store_at(path).missing() == NAMES
+    write_missing_and_finish(path)
+    assert files_of(path) == files_of(finished)  # which do not name the code
 
 
-@pytest.mark.parametrize("name", ["/tmp/outside", "../outside", "..", "a/b"])
-def test_a_store_whose_sequence_could_be_written_elsewhere_is_refused(copy, name):
+def test_a_store_whose_sequence_could_be_written_elsewhere_is_refused(copy):
     header = json.loads((copy / "zarr.json").read_text())["attributes"]
-    names = [*NAMES[:-1], name]
-    checksum = parts_module._checksum({**header, "sequences": names})
-    with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
-        Numbers.open(with_header(copy, sequences=names, checksum=checksum))
-    with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
-        Numbers.create_parts(copy, [name], {}, 1)
+    for name in ("/tmp/outside", "../outside", "..", "a/b"):
+        names = [*NAMES[:-1], name]
+        checksum = parts_module._checksum({**header, "sequences": names})
+        with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
+            Numbers.open(with_header(copy, sequences=names, checksum=checksum))
+        with pytest.raises(ValueError, match="expected a name without slashes and control characters"):
+            Numbers.create_parts(copy, [name], {}, 1)
 
 
 def test_a_finished_store_replaces_the_one_that_was_there(tmp_path, copy):
@@ -279,20 +268,15 @@ def test_every_flipped_bit_and_every_cut_or_missing_file_is_found_and_named(copy
     assert Numbers.verify(copy) == []
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut", "empty", "missing"])
-def test_a_reader_names_sequence_and_column_of_a_damaged_file(copy, damage):
+def test_a_reader_names_sequence_and_column_of_a_damaged_file(copy):
     shard = copy / "part-00001" / "value" / "c" / "0"
     content = shard.read_bytes()
-    if damage == "missing":
-        shard.unlink()
-    elif damage == "flip":
-        flip(shard, 0.9)  # in a chunk of the second sequence
-    else:
-        shard.write_bytes(content[:-3] if damage == "cut" else b"")
-    with pytest.raises(ValueError, match=r"s3, column value of part-00001 is unreadable: .*write this store again"):
-        Numbers.open(copy).read_column("value", "s3")
-    if damage == "flip":
-        assert np.array_equal(Numbers.open(copy).read_column("value", "s2"), values_of("s2"))
+    flip(shard, 0.9)  # in a chunk of the second sequence
+    assert np.array_equal(Numbers.open(copy).read_column("value", "s2"), values_of("s2"))
+    for damaged in (shard.read_bytes(), content[:-3], b"", None):
+        shard.unlink() if damaged is None else shard.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"s3, column value of part-00001 is unreadable: .*write this store again"):
+            Numbers.open(copy).read_column("value", "s3")
 
 
 def test_a_part_of_another_place_or_another_store_is_an_error(copy, tmp_path):
@@ -364,19 +348,9 @@ def with_header(path: Path, **values) -> Path:
     return path
 
 
-@pytest.mark.parametrize("value", [{"a": 1}, 0, 1.5, "2", None])
-def test_a_header_with_a_valid_checksum_and_absurd_values_is_refused(copy, value):
-    header = {**json.loads((copy / "zarr.json").read_text())["attributes"], "sequences_per_part": value}
-    with pytest.raises(ValueError, match=r"copy\.zarr: the attributes in zarr\.json are not those of a store"):
-        Numbers.open(with_header(copy, sequences_per_part=value, checksum=parts_module._checksum(header)))
-
-
 def test_what_cannot_be_a_store_is_refused(finished, tmp_path):
-    for attribute in (float("nan"), tmp_path):
-        with pytest.raises(ValueError, match="finite, plain JSON"):
-            store_at(tmp_path / "store.zarr", threshold=attribute)
-    with pytest.raises(ValueError, match="at least one sequence per part, got 0"):
-        Numbers.create_parts(tmp_path / "store.zarr", NAMES, {}, 0)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        store_at(tmp_path / "store.zarr", threshold=float("nan"))
     with pytest.raises(ValueError, match="expected each name once, got a again"):
         Numbers.create_parts(tmp_path / "store.zarr", ["a", "b", "a"], {}, 1)
     with pytest.raises(ValueError, match="sequences_per_part: expected > 0, got 0"):
