@@ -6,14 +6,13 @@ import platform
 import shutil
 from collections.abc import Callable, Iterator
 
-import psutil
 import torch
 
 from polarnet.metrics.lpips import BACKBONES, local_source
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
-from polarnet.runtime.machine import bf16_units, usable_cores
+from polarnet.runtime.machine import bf16_units, memory, usable_cores
 from polarnet.terminal.installation import EXTRAS, installation, missing, requirements, version_of
 
 PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless",
@@ -30,7 +29,6 @@ def _findings() -> Iterator[tuple[str, str]]:
     cuda = torch.cuda.is_available()
     gpus = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())) if cuda else ""
     units = ", ".join(bf16_units(torch.device("cuda" if cuda else "cpu")))
-    memory = psutil.virtual_memory()
     yield "system", f"Python {platform.python_version()}, {platform.platform()}"
     yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in PACKAGES)
     yield "device", gpus or f"CPU ({platform.processor() or platform.machine()}); no GPU that torch can use"
@@ -41,7 +39,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "weights", _or_error(_shipped)
     for extra, task in EXTRAS.items():
         yield "extra", f"{extra} ({task}): {_extra(extra)}"
-    yield "memory", f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GiB free"
+    yield "memory", "{:.1f} of {:.1f} GiB free".format(*(amount / 2**30 for amount in memory()))
     yield "disk", f"{shutil.disk_usage('.').free / 2**30:.1f} GiB free here"
 
 

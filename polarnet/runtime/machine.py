@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import numba
@@ -59,6 +60,16 @@ def generator_for(seed: int, name: str, purpose: str) -> np.random.Generator:
 def usable_cores() -> int:
     """Number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory() -> tuple[int, int]:
+    """Free and total memory of this machine in bytes; only Linux states how much is free, others count as empty."""
+    if sys.platform == "linux":
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
+        return free, total
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return total, total
 
 
 def limit_threads(threads: int) -> None:
