@@ -9,9 +9,8 @@ from typing import Any
 from polarnet.config.pipeline import set_folder
 from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.artefacts import ReportPaths, read_results, results_table
+from polarnet.reports.artefacts import ReportPaths, Run, facts, read_results, results_table
 from polarnet.reports.page import write_report
-from polarnet.reports.provenance import Run, facts
 from polarnet.reports.tables import as_plain
 
 PLUMBING = ("networks", "rows", "row", "baseline", "paths", "runtime", "cluster")

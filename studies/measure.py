@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 from PIL import Image
 
 from polarnet.config.sweep import sweep_points
+from polarnet.reports.artefacts import git
 from polarnet.reports.maps import png
-from polarnet.reports.provenance import git
 from studies.overview import overview_figure, overview_of
 from studies.study import (
     PICTURES,

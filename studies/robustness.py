@@ -5,26 +5,19 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
     [--limit N] [--write]
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
-- `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
-- `photographs_large`: the same splits of --photographs and of --photographs-large together.
-- `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
-  for each repo; any other folder is one source.
-- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS. `ours, thresholds given` is told the contrast
-  thresholds of the sensor (`methods.ours.thresholds`).
-- `time.5ms`: the scenes of the sensors with windows of 5 ms.
+- `photographs`: a split (`experiment=photographs`) of --photographs; `photographs_large`: of both folders together.
+- `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
+- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 - `time.2000hz.photographs`, `time.2000hz.measured`: frames between windows (`polarnet recover --rate 2000`), at 16
   times between the ends of two windows: `ours`, carried on by motion and events; `ours, held`, the last frame of a
   window unchanged; `ours, window ends`, the frames of the windows themselves.
 
-Under each condition but the last two, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
-
-Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
-the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
-test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
-simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
-
-The second command scores nothing. It fills --training with links to the training photographs of both folders. A
-network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
+`ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
+`train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
+sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
+--sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
+docs/results/robustness.json. The second command fills --training with links to the training photographs of both
+folders: a network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
 """
 
 import argparse
@@ -32,7 +25,7 @@ import functools
 import itertools
 import json
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,8 +58,6 @@ CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 HELD, ENDS = ", held", ", window ends"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
-NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
-"""Rows that need no truth, against which ours is compared on measured scenes."""
 RATE_HZ = 2000
 RATED = f"time.{RATE_HZ}hz"
 TIMES_BETWEEN = 16
@@ -138,15 +129,6 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
     return conditions | {"time.5ms": [(small, ("synthesize.frame_rate_hz=200",))]}
 
 
-def selected(conditions: Mapping[str, Condition], wanted: Sequence[str] | None) -> dict[str, Condition]:
-    """The conditions whose names, or the beginnings of whose names, are `wanted`; None: all."""
-    return {
-        name: parts
-        for name, parts in conditions.items()
-        if wanted is None or any(name == one or name.startswith(f"{one}.") for one in wanted)
-    }
-
-
 def contexts_of(
     condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
 ) -> dict[str, Context]:
@@ -157,14 +139,13 @@ def contexts_of(
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
-    first = next(iter(weights.values()))
-    return contexts | {
-        row: context_of(settings(*overrides, variant), [OURS], train_mean, first) for row, variant in variants.items()
-    }
+    for row, variant in variants.items():
+        contexts[row] = context_of(settings(*overrides, variant), [OURS], train_mean, next(iter(weights.values())))
+    return contexts
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+    scenes: SceneStore, config: Config, contexts: Mapping[str, Context], name: str, constant: float
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
@@ -187,14 +168,13 @@ def scored_sequence(
     return Scores(scores, {test.scene: float(truth.mean())}, errors)
 
 
-def rated_sequence(name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context]) -> Scores:
+def rated_sequence(scenes: SceneStore, config: Config, contexts: Mapping[str, Context], name: str) -> Scores:
     """Scores of the frames between windows and at their ends, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
     warmup, cpu = warmup_windows(config), torch.device("cpu")
     spans = list(itertools.pairwise(test.t_us.tolist()))[warmup + 1 :]
-    times = [
-        round(start + (stop - start) * (k + 0.5) / TIMES_BETWEEN) for start, stop in spans for k in range(TIMES_BETWEEN)
-    ]
+    shares = (np.arange(TIMES_BETWEEN) + 0.5) / TIMES_BETWEEN
+    times = [round(start + (stop - start) * share) for start, stop in spans for share in shares.tolist()]
     later = sequence_at(scenes, name, test.events, torch.tensor([0, *times]))
     predictions = predictions_of(["oracle_mean"], later, next(iter(contexts.values())))
     at_ends = {}
@@ -236,13 +216,11 @@ def frames_between(
             before, later = carried(before, sequence.events, time_us, config.between)
             on.append(later)
             held.append(frame)
-    return [joined(frames) for frames in (at_ends, on, held)]
+    return [clamped(Prediction(*map(_stacked, list(zip(*frames, strict=True))[:3]))) for frames in (at_ends, on, held)]
 
 
-def joined(frames: Sequence[Prediction]) -> Prediction:
-    """DoLP, AoLP and log-variance of several frames, stacked."""
-    maps = [None if fields[0] is None else torch.stack(fields) for fields in list(zip(*frames, strict=True))[:3]]
-    return clamped(Prediction(*maps))  # type: ignore[arg-type]
+def _stacked(maps: Sequence[Any]) -> torch.Tensor | None:
+    return None if maps[0] is None else torch.stack(maps)
 
 
 def warmup_windows(config: Config) -> int:
@@ -252,7 +230,7 @@ def warmup_windows(config: Config) -> int:
 
 def table_of(scores: Scores) -> dict[str, Any]:
     """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
-    errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
+    errors, psnr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr"))
     oracle = errors["oracle_mean"]
     table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
     for row, of_scene in errors.items():
@@ -261,42 +239,11 @@ def table_of(scores: Scores) -> dict[str, Any]:
             "mse": mse,
             "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
-            "level_mse": statistics.fmean(level[row].values()),
             "psnr": statistics.fmean(psnr[row].values()),
-            "corr": statistics.fmean(corr[row].values()),
         }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
     return table
-
-
-def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
-    """Figures of one row that stand above the sections of docs/results/robustness.json."""
-    figures: dict[str, Any] = {}
-    for name in ("photographs", "photographs_large"):
-        if name in tables:
-            figures[name] = {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
-    if "measured" in tables:
-        rows = tables["measured"]["rows"]
-        best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
-        keys = ("mse_over_oracle_mean", "median_over_oracle_mean")
-        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best} | {
-            key: rows[row][key] for key in keys
-        }
-        figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
-    if "sensors.default" in tables:
-        default = tables["sensors.default"]["rows"][row]["mse"]
-        relative = {
-            name.removeprefix("sensors."): table["rows"][row]["mse"] / default
-            for name, table in tables.items()
-            if name.startswith("sensors.")
-        }
-        figures["sensors"] = {"worst_over_default": max(relative.values())}
-    rated = [table["rows"] for name, table in tables.items() if name.startswith(RATED)]
-    if rated:
-        lost = max(rows[row + ENDS]["psnr"] - rows[row]["psnr"] for rows in rated)
-        figures["time"] = {f"db_lost_{RATE_HZ}hz": lost}
-    return figures
 
 
 def tables_of(
@@ -313,16 +260,11 @@ def tables_of(
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
-            config, contexts = (
-                settings(*common, *overrides),
-                contexts_of(name, (*common, *overrides), train_mean, weights),
-            )
+            config = settings(*common, *overrides)
+            contexts = contexts_of(name, (*common, *overrides), train_mean, weights)
             scenes = scenes_of(images, config)
-            task: Callable[[str], Scores] = functools.partial(
-                scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant
-            )
-            if name.startswith(RATED):
-                task = functools.partial(rated_sequence, scenes=scenes, config=config, contexts=contexts)
+            score = functools.partial(scored_sequence, constant=constant)
+            task = functools.partial(rated_sequence if name.startswith(RATED) else score, scenes, config, contexts)
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
@@ -333,8 +275,8 @@ def tables_of(
     return tables
 
 
-def parsed() -> argparse.Namespace:
-    """The command line."""
+def main() -> None:
+    """Score, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/robustness.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--photographs-large", type=Path, help="further photographs")
@@ -352,12 +294,7 @@ def parsed() -> argparse.Namespace:
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
-    return arguments
-
-
-def main() -> None:
-    """Score, print and perhaps write."""
-    arguments, record = parsed(), machine_record()
+    record = machine_record()
     common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
     for row, _, file in (given.partition("=") for given in arguments.published):
         common.append(row_of(row, Path(file)))
@@ -377,14 +314,16 @@ def main() -> None:
         if name.startswith("measured.")
     }
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    tables = tables_of(selected(conditions, arguments.conditions), means, train_mean, arguments.weights, common)
-    figures = headlines(tables, next(iter(arguments.weights)))
-    print(json.dumps(figures, indent=1))
+    if wanted := arguments.conditions:
+        conditions = {
+            name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
+        }
+    tables = tables_of(conditions, means, train_mean, arguments.weights, common)
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
-        write_section("robustness", arguments.split, section, record, figures if arguments.split == "test" else None)
+        write_section("robustness", arguments.split, section, record)
 
 
 if __name__ == "__main__":

@@ -36,19 +36,11 @@ from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.storage.events import EventStore
 from studies.simulated_rig import Drift
+from studies.simulation_pictures import QUIET
 from studies.study import arguments_of, command_line, in_own_process, machine_record, run_stage, write_section
 
 HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
 DEFAULT = replace(SENSORS["default"], model="v2e")  # v2e's command-line defaults
-NOISELESS = replace(
-    DEFAULT,
-    contrast_threshold_sigma_on=0.0,
-    contrast_threshold_sigma_off=0.0,
-    cutoff_hz=0.0,
-    leak_rate_hz=0.0,
-    shot_noise_rate_hz=0.0,
-    refractory_period_us=0.0,
-)
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
 ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
@@ -100,7 +92,7 @@ def timing_errors_ms() -> dict[str, float]:
     scene, path = clip()
 
     def events_of(model: str, rate_hz: float) -> list[Events]:
-        config = replace(NOISELESS, model=model, render_rate_hz=rate_hz)
+        config = replace(QUIET, model=model, render_rate_hz=rate_hz)
         return list(emulate_motion(Camera(config, key=1), scene, path, DURATION_US, (HEIGHT, WIDTH)))
 
     reference = events_of("exact", REFERENCE_HZ)

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from polarnet.reports.provenance import git, processor
+from polarnet.reports.artefacts import git, processor
 from polarnet.runtime.machine import bf16_units, usable_cores
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,10 +11,9 @@ from ruamel.yaml import YAML
 
 from polarnet.methods import METHODS, is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
-from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, read_results, training_history
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, training_history
 from polarnet.reports.charts import reliability_chart, scatter_chart, score_chart, sets_chart, training_chart
 from polarnet.reports.figures import svg
-from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
@@ -28,8 +27,7 @@ from polarnet.reports.legend import (
 )
 from polarnet.reports.maps import png
 from polarnet.reports.paper import comparison_figure, write_paper_files
-from polarnet.reports.player import panel_film, player_data
-from polarnet.reports.provenance import Run
+from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
 from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, Table, paper_table, score_table
 from polarnet.storage.scenes import SceneStore
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from polarnet.characterization.twin import INTERVAL_EDGES_US, Comparison
 from polarnet.reports.figures import PAGE, styled, svg
-from polarnet.reports.html import template
+from polarnet.reports.player import template
 
 LABELS = {"recording": "recording", "twin": "simulated twin"}
 

@@ -7,7 +7,7 @@ from polarnet.benchmark.score import FrameScore
 from polarnet.config.pipeline import context_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.storage.scenes import SceneStore
-from studies.robustness import SENSORS, Scores, headlines, rated_sequence, table_of
+from studies.robustness import SENSORS, Scores, rated_sequence, table_of
 from studies.scored_pictures import settings, sources_of
 from studies.speed_of_network import EVENTS_PER_PIXEL, random_channels, windows_of
 
@@ -15,45 +15,21 @@ ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
 DOLP = {"pale": 0.03, "middle": 0.1, "strong": 0.5}
 
 
-def scores(factor: float = 2.0) -> Scores:
-    """Three scenes; the error of `ours` is `factor` times the oracle mean's, that of zeros ten times."""
+def test_errors_are_means_and_medians_over_scenes_relative_to_the_oracle_mean():
     rows = [
         FrameScore(method, scene, scene, 5, 200_000, times * error, 20.0, 0.5, None, 0.1, 0.1, 0.0, error, None, error)
-        for method, times in (("oracle_mean", 1.0), ("zeros", 10.0), ("ours", factor))
+        for method, times in (("oracle_mean", 1.0), ("ours", 2.0))
         for scene, error in ERRORS.items()
     ]
-    return Scores(rows, DOLP, {})
-
-
-def test_errors_are_means_and_medians_over_scenes_relative_to_the_oracle_mean():
-    row = table_of(scores())["rows"]["ours"]
+    row = table_of(Scores(rows, DOLP, {}))["rows"]["ours"]
     assert row["mse"] == pytest.approx(2 * sum(ERRORS.values()) / 3)
     assert row["mse_over_oracle_mean"] == row["median_over_oracle_mean"] == pytest.approx(2)
-
-
-def test_sensors_are_compared_with_the_default_one():
-    tables = {"sensors.default": table_of(scores()), "sensors.noisy": table_of(scores(factor=3.0))}
-    assert headlines(tables, "ours")["sensors"]["worst_over_default"] == pytest.approx(1.5)
-
-
-def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
-    rows = table_of(scores())
-    rows["rows"]["ours"]["error_factor"] = 1.2
-    assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
-
-
-def test_the_loss_between_windows_is_the_larger_of_photographs_and_measured_scenes():
-    def rated(ends: float, between: float) -> dict:
-        return {"rows": {"ours": {"psnr": between}, "ours, window ends": {"psnr": ends}}}
-
-    tables = {"time.2000hz.photographs": rated(20.0, 19.9), "time.2000hz.measured": rated(23.0, 22.7)}
-    assert headlines(tables, "ours")["time"] == {"db_lost_2000hz": pytest.approx(0.3)}
 
 
 def test_frames_between_windows_are_scored_sixteen_times_a_window(simulated):
     config, scenes = settings("seed=3", "benchmark.warmup_windows=2", "synthesize.duration_s=0.2"), simulated.scenes
     contexts = {"ours": context_of(config, ["oracle_mean", "ours"], 0.3, shipped_weights())}
-    rated = rated_sequence("a-0", SceneStore.open(scenes), config, contexts)  # 6 windows, 2 of them warm-up
+    rated = rated_sequence(SceneStore.open(scenes), config, contexts, "a-0")  # 6 windows, 2 of them warm-up
     numbers = Counter(row.method for row in rated.rows)
     assert numbers == {"oracle_mean": 48, "ours": 48, "ours, held": 48, "ours, window ends": 4}
     carried, held = ([row.mse for row in rated.rows if row.method == name] for name in ("ours", "ours, held"))
