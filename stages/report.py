@@ -25,10 +25,7 @@ def plain(value: Any) -> Any:
 @hydra_stage
 def main(config: Config) -> None:
     """Put the tables together from the rows of `benchmark.methods`, write the report and print its location."""
-    try:
-        tables = collect_rows(config)
-    except FileNotFoundError as error:
-        raise SystemExit(str(error)) from None
+    tables = collect_rows(config)
     copy_histories(config)
     for name in tables:
         print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))

@@ -47,7 +47,9 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
     row, column = events.y.numpy().astype(np.int64), events.x.numpy().astype(np.int64)
     p = events.p.numpy()
-    first_is_darker = _first_is_darker(row * WIDTH + column, p)
+    first_is_darker = np.zeros(len(p), np.bool_)
+    first_is_darker[np.unique(row * WIDTH + column, return_index=True)[1]] = True
+    first_is_darker &= p < 0
     stamp = np.concatenate([np.zeros(first_is_darker.sum(), np.int64), stamp])
     row, column = (np.concatenate([values[first_is_darker], values]) for values in (row, column))
     p = np.concatenate([np.ones(first_is_darker.sum(), np.int8), p])
@@ -119,12 +121,6 @@ def _packed_picture(picture: np.ndarray) -> np.ndarray:
     dark[0, 0] = FULL_PICTURE << 9
     low = dark[:, 0] & 15 | (dark[:, 1] & 15) << 4
     return np.stack([dark[:, 0] >> 4, dark[:, 1] >> 4, low], axis=1).astype(np.uint8)
-
-
-def _first_is_darker(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> np.ndarray:
-    first = np.zeros(len(p), np.bool_)
-    first[np.unique(pixel, return_index=True)[1]] = True
-    return first & (p < 0)
 
 
 def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndarray, " n"]:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from polarnet.config.tree import load
 from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events
 from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
@@ -202,17 +201,13 @@ def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float
     return channel_light(light, polarizers, weights_of(polarizers, *SIZE, key=1))[:, 0].astype(np.float64) / 255
 
 
-def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:
-    """Stokes parameters of the scene under the same sensor."""
-    top, left = (scene.height - SIZE[0]) // 2, (scene.width - SIZE[1]) // 2
-    return scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
-
-
 @drawn(9.0, 2.8)
 def readout_figure(figure: Figure) -> None:
     """Draw the times of a flash by row, and a bus whose limit the events exceed."""
     rows, rate, waits = figure.subplots(1, 3)
-    flash = _flash()
+    t_us = torch.tensor([0.0, 5_000.0, 5_001.0, 30_000.0], dtype=torch.float64)
+    card = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
+    (flash,), _ = emulate(card, t_us, QUIET, key=1)  # a grey card becomes brighter at 5 ms
     for readout, colour, label in (
         (PERFECT, LIGHT.quiet, "perfect"),
         (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
@@ -245,14 +240,6 @@ def readout_figure(figure: Figure) -> None:
     waits.set(xlabel="mean rate / limit", ylabel="events lost", ylim=(0, None))
     waits.legend(fontsize=7, frameon=False)
     waits.set_title("loss against load", loc="left", fontsize=9)
-
-
-def _flash() -> Events:
-    """A grey card that becomes brighter at 5 ms, seen by 60 x 80 pixels."""
-    t_us = np.array([0.0, 5_000.0, 5_001.0, 30_000.0])
-    light = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
-    (events,), _ = emulate(light, torch.from_numpy(t_us), QUIET, key=1)
-    return events
 
 
 def periodic_scene(columns: int) -> PolarizationScene:
@@ -323,7 +310,9 @@ def _behind(degree: float, angle_deg: float) -> float:
 @drawn(7.2, 2.0)
 def gains_figure(figure: Figure) -> None:
     """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
-    truth = true_stokes(photograph())
+    scene = photograph()
+    top, left = (scene.height - SIZE[0]) // 2, (scene.width - SIZE[1]) // 2
+    truth = scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
     noise = 1 + NOISE * torch.randn((4, *truth.shape[1:]), generator=torch.Generator().manual_seed(1))
     measured = (intensities_from_stokes(truth) + DARKEST) * noise
     wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]

@@ -110,7 +110,8 @@ def write_rig(
 
     camera = Camera(emulator, key=seed_for(seed, name, "emulate"))
     channels = emulate_motion(camera, scene, path, total_us, (height, width), threads)
-    hot = _random_pixels(config.hot_pixels, recordings, generator)
+    places = (generator.integers(0, side, config.hot_pixels).tolist() for side in recordings.sensor)
+    hot = frozenset(zip(*places, strict=True))
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
         begin_us = landmark_us - start_us[capture]
@@ -199,13 +200,6 @@ def _pictures(
         whole = np.zeros((HEIGHT, WIDTH), np.uint16)
         whole[:height, :width] = np.clip(np.rint(values), 0, WHITE)
         yield whole
-
-
-def _random_pixels(
-    count: int, recordings: RecordingsConfig, generator: np.random.Generator
-) -> frozenset[tuple[int, int]]:
-    rows, columns = (generator.integers(0, side, count).tolist() for side in recordings.sensor)
-    return frozenset(zip(rows, columns, strict=True))
 
 
 def _hot_events(

@@ -1,7 +1,6 @@
 """`polarnet doctor`: versions, device and resources of this machine that matter to polarnet."""
 
 import argparse
-import functools
 import platform
 import shutil
 from collections.abc import Callable, Iterator
@@ -35,8 +34,10 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "threads", f"{usable_cores()} cores, torch uses {torch.get_num_threads()}"
     yield "bf16", units or "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
     for backbone in BACKBONES:
-        yield "LPIPS", _or_error(functools.partial(_lpips, backbone))
-    yield "weights", _or_error(_shipped)
+        yield "LPIPS", _or_error(lambda backbone=backbone: f"{backbone}: {local_source(backbone, None)}")
+    file = shipped_weights()
+    digest = sha256(file)[:12]
+    yield "weights", _or_error(lambda: f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {digest})")
     for extra, task in EXTRAS.items():
         yield "extra", f"{extra} ({task}): {_extra(extra)}"
     yield "memory", "{:.1f} of {:.1f} GiB free".format(*(amount / 2**30 for amount in memory()))
@@ -48,15 +49,6 @@ def _or_error(finding: Callable[[], str]) -> str:
         return finding()
     except (ValueError, FileNotFoundError) as error:
         return str(error)
-
-
-def _lpips(backbone: str) -> str:
-    return f"{backbone}: {local_source(backbone, None)}"
-
-
-def _shipped() -> str:
-    file = shipped_weights()
-    return f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {sha256(file)[:12]})"
 
 
 def _extra(extra: str) -> str:

@@ -70,7 +70,9 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml.width = 120
     yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
-    params, base = yaml.load(path), _flat(_original(root))
+    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
+    original = shipped_settings() / "params.yaml" if committed.returncode else committed.stdout
+    params, base = yaml.load(path), _flat(YAML(typ="safe").load(original))
     undone = GROUPS if group == "experiment" else (group,)
     others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
     values = {key: base.get(key) for other in others for key in other} | preset_values(root, group, name)
@@ -86,13 +88,6 @@ def write_preset(root: Path, name: str) -> list[str]:
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
-
-
-def _original(root: Path) -> Any:
-    """params.yaml as last committed, or as it came with polarnet."""
-    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
-    shipped = shipped_settings() / "params.yaml"
-    return YAML(typ="safe").load(shipped if committed.returncode else committed.stdout)
 
 
 def _in_style(value: Any) -> Any:

@@ -41,7 +41,6 @@ from polarnet.training.engine.loop import LoopConfig, TrainConfig
 from polarnet.training.engine.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
-EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 BEST = "best.safetensors"
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
@@ -312,8 +311,12 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
         or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        if script != "weights":  # that stage searches for weights and may download them
-            or_exit(lambda: _check_lpips(config))
+        for purpose in PURPOSES if script != "weights" else ():  # that stage searches for weights and may download them
+
+            def stored_or_here(backbone: str, path: str | None, purpose: Purpose = purpose) -> bool:
+                return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+
+            or_exit(functools.partial(with_lpips, config, purpose, stored_or_here))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
@@ -352,21 +355,14 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
 
 
 def input_folder(key: str, folder: str) -> Path:
-    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files.
-
-    A queued DVC experiment runs in a copy of the workspace; there the message says how to bring in the files.
-    """
+    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files."""
     files = (path for path in Path(folder).rglob("*") if (path.is_file() or path.is_symlink()) and path.name[0] != ".")
     if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
         return Path(folder)
-    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
-    advice = f"put your files there, or set {key} to another folder"
-    if copy:
-        advice = (
-            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
-            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
-        )
-    raise SystemExit(f"{key}={folder}: no files there; {advice}")
+    raise SystemExit(
+        f"{key}={folder}: no files there; put your files there, or set {key} to another folder (for a queued "
+        f"experiment, to its absolute path)"
+    )
 
 
 def _root_of(main: Callable[..., None]) -> Path:
@@ -397,16 +393,6 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
     except ValueError as error:
         without = " ".join(f"{key}={off}" for key in asking)
         raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
-
-
-def _check_lpips(config: Config) -> None:
-    """Raise ValueError unless stage `weights` has stored the required weights or can find them without a download."""
-
-    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
-        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
-
-    for purpose in PURPOSES:
-        with_lpips(config, purpose, functools.partial(look, purpose))
 
 
 def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:

@@ -101,21 +101,15 @@ class Run:
 
 def facts(root: Path) -> dict[str, str]:
     """Commit of the project at `root`, if any, and machine and versions of this process."""
+    commit = git(root, "rev-parse", "HEAD") or "none: not a git repository with a commit"
+    # the pipeline's own outputs do not count as changes of the code
+    changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     return {
-        "commit": _commit(root),
+        "commit": f"{commit}, with uncommitted changes" if changed else commit,
         "machine": f"{processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
         "versions": f"Python {platform.python_version()}, {versions}",
     }
-
-
-def _commit(root: Path) -> str:
-    commit = git(root, "rev-parse", "HEAD")
-    if not commit:
-        return "none: not a git repository with a commit"
-    # the pipeline's own outputs do not count as changes of the code
-    changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
-    return f"{commit}, with uncommitted changes" if changed else commit
 
 
 def git(root: Path, *arguments: str) -> str:

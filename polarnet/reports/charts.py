@@ -124,7 +124,9 @@ def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], leg
 def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Figure:
     """Heat map: MSE of each method on each test set, divided by the best constant's; no tile without both."""
     methods = with_structure(dict.fromkeys(method for one in sets for method in one.metrics))
-    ratios = np.array([[_to_constant(one, method) for one in sets] for method in methods])
+    errors = [[one.metrics.get(row, {}).get("mse") for one in sets] for row in [*methods, "oracle_mean"]]
+    known = np.array(errors, float)  # not a number where an error is unknown
+    ratios = known[:-1] / known[-1]
     figure, axes = _method_axes([legend.label(method) for method in methods])
     logarithms = np.log(ratios)
     axes.imshow(logarithms, cmap="cividis_r", aspect="auto")
@@ -137,12 +139,6 @@ def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legen
             ink = "#ffffff" if logarithms[row, column] > middle else "#10141b"
             axes.text(column, row, f"{ratio:.2f}", ha="center", va="center", color=ink)
     return figure
-
-
-def _to_constant(one: Results, method: str) -> float:
-    """MSE of a method on a set, divided by that of the best constant; not a number where either is unknown."""
-    mse, constant = (one.metrics.get(row, {}).get("mse") for row in (method, "oracle_mean"))
-    return mse / constant if mse and constant else float("nan")
 
 
 @styled(LIGHT)

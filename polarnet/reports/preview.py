@@ -69,8 +69,10 @@ class VideoWriter:
         """Add a picture in RGB."""
         even = with_even_sides(picture)
         if self._file is None:
-            self._open(even.shape[0], even.shape[1])
-        assert self._file is not None
+            self._file = av.open(str(self.path), "w", format="mp4", options=LAYOUT)
+            self._stream = self._file.add_stream(CODEC, rate=self.rate, options=QUALITY)
+            self._stream.height, self._stream.width, self._stream.pix_fmt = *even.shape[:2], PIXELS
+            self._stream.codec_context.gop_size = max(1, round(SECONDS_PER_FRAGMENT * self.rate))
         if even.shape[:2] != (self._stream.height, self._stream.width):
             expected = f"{self._stream.height} x {self._stream.width}"
             raise ValueError(f"{self.path}: expected pictures of {expected} px, got {even.shape[0]} x {even.shape[1]}")
@@ -83,12 +85,6 @@ class VideoWriter:
             self._file.mux(self._stream.encode())
             self._file.close()
             self._file = None
-
-    def _open(self, height: int, width: int) -> None:
-        self._file = av.open(str(self.path), "w", format="mp4", options=LAYOUT)
-        self._stream = self._file.add_stream(CODEC, rate=self.rate, options=QUALITY)
-        self._stream.height, self._stream.width, self._stream.pix_fmt = height, width, PIXELS
-        self._stream.codec_context.gop_size = max(1, round(SECONDS_PER_FRAGMENT * self.rate))
 
 
 def with_even_sides(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -172,10 +168,8 @@ class Sheet:
         if left - zero < MARGIN + _font().getlength(text) + EMPTY:
             return
         bar = Image.fromarray(DOLP_TABLE[None]).resize(BAR, Image.Resampling.NEAREST)
-        for part, place in (
-            (_line("DoLP 0", zero), left - 6 - zero), (_line("1", one), left + length + 4)
-        ):  # fmt: skip
-            sheet.paste(part, (place, top))
+        sheet.paste(_line("DoLP 0", zero), (left - 6 - zero, top))
+        sheet.paste(_line("1", one), (left + length + 4, top))
         sheet.paste(bar, (left, top + (LINE - height) // 2))
 
 
@@ -271,9 +265,7 @@ def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = 
 def _line(text: str, width: int) -> Image.Image:
     """A line of text, for reading only; what does not fit into the width is cut off."""
     line = Image.new("RGB", (width, LINE), "white")
-    ImageDraw.Draw(line).text(
-        (0, LINE - 6), text, fill=TEXT_COLOUR, font=_font(), anchor="ls"
-    )  # base line above the edge
+    ImageDraw.Draw(line).text((0, LINE - 6), text, fill=TEXT_COLOUR, font=_font(), anchor="ls")  # on the base line
     return line
 
 

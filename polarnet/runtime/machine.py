@@ -79,25 +79,18 @@ def limit_threads(threads: int) -> None:
 
 
 @contextmanager
-def torch_threads(number: int) -> Iterator[None]:
-    """Run torch on this number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
 def one_thread() -> Iterator[None]:
     """Run torch on one thread, so that its bytes do not depend on the number of threads.
 
     Threads split an image between them. torch computes the last values of each part one by one, and rounds them
     differently from whole vectors.
     """
-    with torch_threads(1):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
         yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
@@ -139,9 +132,7 @@ def bf16_units(device: torch.device) -> list[str]:
 
 def precision_on(device: torch.device, precision: str) -> str:
     """fp32 or bf16: `precision`, or for auto, bf16 if the device has units for it."""
-    if precision == "auto":
-        return "bf16" if bf16_units(device) else "fp32"
-    return precision
+    return precision if precision != "auto" else "bf16" if bf16_units(device) else "fp32"
 
 
 def end_with_parent(parent: int | None = None) -> None:

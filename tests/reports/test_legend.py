@@ -1,7 +1,7 @@
 import pytest
 
 from polarnet.methods import METHODS, ROWS
-from polarnet.reports.legend import NETWORKS, glossary, legend_of, lpips_about
+from polarnet.reports.legend import NETWORKS, glossary, legend_of
 
 
 def weights(**networks):
@@ -43,8 +43,3 @@ def test_every_method_is_explained_with_the_weights_that_it_takes():
     assert all(len(about) > 30 for about in entries.values())
     assert entries["CISTA-TC, published weights"].startswith("CISTA-TC (Liu and Dragotti 2022), a recurrent network")
     assert entries["E2V: FireNet"].startswith("Events to video. FireNet (Scheerlinck et al. 2020)")
-
-
-@pytest.mark.parametrize(("backbone", "name"), [("vgg", "VGG16"), ("alex", "AlexNet")])
-def test_lpips_is_explained_with_its_backbone(backbone, name):
-    assert f"with {name} as its backbone" in lpips_about({"backbone": backbone})
