@@ -311,12 +311,8 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
         or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
-        for purpose in PURPOSES if script != "weights" else ():  # that stage searches for weights and may download them
-
-            def stored_or_here(backbone: str, path: str | None, purpose: Purpose = purpose) -> bool:
-                return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
-
-            or_exit(functools.partial(with_lpips, config, purpose, stored_or_here))
+        if script != "weights":  # that stage searches for weights and may download them
+            or_exit(lambda: _check_lpips(config))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
@@ -395,6 +391,16 @@ def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None]
         raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
 
 
+def _check_lpips(config: Config) -> None:
+    """Raise ValueError unless stage `weights` has stored the required weights or can find them without a download."""
+
+    def look(purpose: Purpose, backbone: str, path: str | None) -> bool:
+        return is_stored(config.paths.weights, purpose, backbone) or bool(local_source(backbone, path))
+
+    for purpose in PURPOSES:
+        with_lpips(config, purpose, functools.partial(look, purpose))
+
+
 def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
     """Raise ValueError if the chosen ablation changes no setting in use.
 
@@ -409,14 +415,11 @@ def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
     if _in_use(config) != _in_use(without):
         return
     experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
-    reasons = []
-    for key in preset_values(root, "ablation", name):
-        if key.startswith("networks.") and key.split(".")[1] != config.network:
-            reasons.append(f"{key} has no effect on network={config.network}")
-        else:
-            value = functools.reduce(getattr, key.split("."), config)
-            reasons.append(f"{key} is {value} already in {experiment}")
-    raise ValueError(f"ablation={name} changes nothing: {', '.join(reasons)}")
+    values = ", ".join(f"{key}={value}" for key, value in preset_values(root, "ablation", name).items())
+    raise ValueError(
+        f"ablation={name} changes nothing: {values} stands already in {experiment}, or is of another network than "
+        f"{config.network}; choose another ablation"
+    )
 
 
 def _in_use(config: Config) -> tuple[Any, ...]:

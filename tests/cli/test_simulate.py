@@ -117,17 +117,13 @@ def test_one_measurement_of_polarization_is_a_scene_under_a_moving_sensor():
     assert_equal(stored(), simulate(scene, MOTION, SENSORS["clean"], seed=1).events)
 
 
-def test_an_mp4_gives_the_events_of_its_frames_at_its_own_times(capsys):
+def test_an_mp4_gives_the_events_of_its_frames_at_its_own_times_and_all_channels_see_the_same_grey(capsys):
     write_video("walk.mp4", scenery(3))
     assert main(["simulate", "walk.mp4", "--out", "out", "sensor=noisy", "seed=7"]) == 0
     assert_equal(stored(), simulate_video(rgb(decoded("walk.mp4")), T_US, SENSORS["noisy"], seed=7))
     assert "0.167 s, 6 true frames" in capsys.readouterr().out
     preview = cv2.VideoCapture("out/preview.mp4")
     assert preview.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES - 1
-
-
-def test_a_grey_mp4_is_unpolarized_and_all_channels_see_the_same_light(capsys):
-    write_video("walk.mp4", scenery(1))
     assert main(["simulate", "walk.mp4", "--out", "out", "sensor=clean", "--grey", "--no-preview",
                  "emulate.contrast_threshold_sigma_on=0", "emulate.contrast_threshold_sigma_off=0"]) == 0  # fmt: skip
     first, *others = stored()

@@ -67,31 +67,42 @@ def test_a_wrong_key_value_or_choice_is_refused_with_those_that_are_allowed(proj
 
 
 @pytest.mark.parametrize(
-    ("stage", "override", "refusal"),
+    ("stage", "overrides", "refusal"),
     [
-        ("train", "experiment=smok", "experiment: there is no 'smok'; "),
-        ("trial", "experiment=smok", "experiment: there is no 'smok'; "),
-        ("synthesize", "synthesize.duration_s=-1.0", "synthesize.duration_s: expected > 0"),
+        ("train", ["experiment=smok"], "configuration error: experiment: there is no 'smok'; "),
+        ("trial", ["experiment=smok"], "configuration error: experiment: there is no 'smok'; "),
+        ("synthesize", ["synthesize.duration_s=-1.0"], "configuration error: synthesize.duration_s: expected > 0"),
+        ("ingest", ["ingest.source=folder", "ingest.root=EMPTY"], "ingest.root=EMPTY: no files there; put your files"),
+        (
+            "sets",
+            ["benchmark.sets=[simulated,measured]", "sets.measured_root=EMPTY"],
+            "sets.measured_root=EMPTY: no",
+        ),
+        ("import_recordings", ["recordings.enabled=true", "recordings.root=EMPTY"], "recordings.root=EMPTY: no files"),
     ],
 )
-def test_a_stage_refuses_a_wrong_value_before_it_runs_anything(project_root, tmp_path, stage, override, refusal):
-    done = preloaded.run_stage(project_root, stage, [override, f"paths.data={tmp_path}"])
+def test_a_stage_refuses_a_wrong_value_and_an_empty_folder_in_one_line(
+    project_root, tmp_path, stage, overrides, refusal
+):
+    (tmp_path / "empty").mkdir()
+    values = [override.replace("EMPTY", str(tmp_path / "empty")) for override in overrides]
+    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
     assert done.returncode == 1
-    assert done.stdout.startswith(f"configuration error: {refusal}")
+    assert done.stdout.startswith(refusal.replace("EMPTY", str(tmp_path / "empty")))
     assert "Traceback" not in done.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert "configuration" not in refusal or not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        (["ablation=similarity"], r"loss\.ssim is 1\.0 already in params\.yaml"),
-        (["experiment=smoke", "ablation=similarity"], r"loss\.ssim is 1\.0 already in experiment=smoke"),
-        (["network=paper", "ablation=memories"], r"networks\.polarnet\.memories has no effect on network=paper"),
+        (["ablation=similarity"], r"loss\.ssim=1\.0 stands already in params\.yaml, "),
+        (["experiment=smoke", "ablation=similarity"], r"loss\.ssim=1\.0 stands already in experiment=smoke, "),
+        (["network=paper", "ablation=memories"], r"networks\.polarnet\.memories=.* is of another network than paper; "),
     ],
 )
 def test_an_ablation_that_changes_nothing_is_refused_with_the_value_there_is(project_root, overrides, reason):
-    with pytest.raises(ValueError, match=f"ablation=[a-z]+ changes nothing: {reason}$"):
+    with pytest.raises(ValueError, match=f"ablation=[a-z]+ changes nothing: {reason}"):
         load(project_root, overrides)
 
 
@@ -119,23 +130,6 @@ def test_a_params_yaml_with_more_than_values_is_refused_before_hydra_reads_it(pr
     (project / "params.yaml").write_text(f"{text}\n")
     with pytest.raises(ValueError, match=message):
         load(project)
-
-
-@pytest.mark.parametrize(
-    ("stage", "overrides"),
-    [
-        ("ingest", ["ingest.source=folder", "ingest.root={}"]),
-        ("sets", ["benchmark.sets=[simulated,measured]", "sets.measured_root={}"]),
-        ("import_recordings", ["recordings.enabled=true", "recordings.root={}"]),
-    ],
-)
-def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
-    (tmp_path / "empty").mkdir()
-    values = [override.format(tmp_path / "empty") for override in overrides]
-    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
-    assert done.returncode == 1
-    assert done.stdout.startswith(f"{values[-1]}: no files there; put your files there")
-    assert "Traceback" not in done.stdout
 
 
 E2P = "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}"
