@@ -37,9 +37,8 @@ class SweepTable(Callback):
         rows = sweep_rows(points)
         write_csv(rows, folder / "comparison.csv")
         if axes := swept_axes(rows):
-            from polarnet.reports.charts import (
-                parallel_coordinates,  # every stage imports this module; only a sweep draws
-            )
+            # every stage imports this module, and only a sweep draws
+            from polarnet.reports.charts import parallel_coordinates
             from polarnet.reports.maps import png
 
             (folder / "comparison.png").write_bytes(png(parallel_coordinates(*axes, "validation MSE")))
