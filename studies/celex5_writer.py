@@ -139,11 +139,7 @@ def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndar
 
 
 def _stamps(stamp: np.ndarray, announced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps to send, and the index of the event that each precedes.
-
-    The stamps are close enough to stay unambiguous when they wrap. The first is 0; one comes before each of the
-    `announced` events.
-    """
+    """Time stamps to send, from 0 and close enough to stay unambiguous; and the index of the event behind each."""
     step = 2**15
     sent = stamp[announced]
     before = np.concatenate([[0], sent[:-1]])[: len(sent)]

@@ -1,13 +1,10 @@
 """Accuracy of the calibration of a simulated rig: python -m studies.rig [--write] [--targets N]
 
-Each target is another picture: photographs of scikit-image and dead leaves. Its eight captures are written as CeleX-5
-files with random delays, sensor noise and hot pixels, and then imported and calibrated as in the stages. The study
-prints errors of the start times from the landmark (in camera frames) and refined (in ms). The refined errors exclude
-the part common to all eight captures, because the zero of their clock is a convention. It also prints the RMS
-difference between the DoLP and the scene's own. The sensor is a quarter of a CeleX-5 in each direction.
-
-`--write` puts the figures into docs/results/recordings.json, what `polarnet inspect` says of a capture into
-docs/results/inspection.json, and draws the pictures of docs/recordings.md and docs/recordings-dot.md.
+Each target is another picture. Its eight captures are written as CeleX-5 files with random delays, sensor noise and hot
+pixels, then imported and calibrated as in the stages. The study prints errors of the start times from the landmark (in
+camera frames) and refined (in ms, without the part common to all captures: the zero of their clock is a convention),
+and the RMS difference between the DoLP and the scene's own. `--write` puts them into docs/results/recordings.json, what
+`polarnet inspect` says of a capture into docs/results/inspection.json, and draws the pictures of the recordings' pages.
 """
 
 import json

@@ -1,8 +1,7 @@
 """A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times, giving eight files with their truth.
 
-The scene drifts from right to left at constant speed. A bright stripe runs above it, and a dark landmark enters on the
-stripe from the right. Until then the region in the upper right corner is bright. Each capture starts at a random time
-before the landmark.
+The scene drifts from right to left. A bright stripe runs above it, and a dark landmark enters on the stripe from the
+right. Each capture starts at a random time before the landmark.
 """
 
 import dataclasses
@@ -92,10 +91,9 @@ def write_rig(
     seed: int,
     threads: int = 1,
 ) -> RigTruth:
-    """Write the eight captures of a target into `folder`, and return the truth.
+    """Write the eight captures of a target into `folder`, and return the truth; seed and folder name decide all chance.
 
-    `picture` is enlarged to the area that the moving sensor sees. All random values depend on the seed and the folder's
-    name only.
+    `picture` is enlarged to the area that the moving sensor sees.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

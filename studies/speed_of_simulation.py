@@ -1,16 +1,12 @@
 """Speed and accuracy of the emulator: python -m studies.speed_of_simulation [--write] [--paper-set N]
 
-The clip is scikit-image's coffee photograph mapped to polarization, a sensor of 120 x 180 pixels that drifts over it at
-110 px/s, 300 steps a second, four channels, one second. Times run from rendering to columns in memory and are medians
-of wall-clock time with compiled kernels. Every model and number of threads runs in its own process, and the processes
-take turns over several rounds, so that other load on the machine affects all of them alike.
+A sensor of 120 x 180 pixels drifts over the coffee photograph at 110 px/s for a second: 300 steps, four channels. Times
+run from rendering to columns in memory and are medians of wall-clock time with compiled kernels. Every model and number
+of threads runs in its own process; the processes take turns, so that other load affects all of them alike. Timing
+errors are those of noiseless pixels relative to `exact` at 4800 steps a second, where all polarities agree.
 
-Timing errors are those of noiseless pixels with equal thresholds, relative to `exact` at 4800 steps a second. They
-cover the pixels whose polarities agree from the first event to the last.
-
-The paper's set is made by the stages ingest, synthesize and emulate with experiment=paper on two workers, from the
-built-in photographs and dead leaves. `--paper-set N` makes about N sequences instead of 1000; minutes are never scaled.
-`--write` puts the figures into docs/results/emulation.json.
+The paper's set is made by ingest, synthesize and emulate with experiment=paper on two workers; `--paper-set N` makes
+about N sequences instead of 1000. `--write` puts the figures into docs/results/emulation.json.
 """
 
 import argparse

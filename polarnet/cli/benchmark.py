@@ -1,7 +1,6 @@
 """`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
 
-Pictures, scenes and events of a user's folder stay in `work` of the output, so that a stopped run resumes and a second
-run only runs the methods.
+Scenes and events of a user's folder stay in `work` of the output: a second run only runs the methods.
 """
 
 import argparse
@@ -82,11 +81,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
-    """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out.
-
-    Size, duration and sensor of simulated scenes are printed first, with a warning if a network was trained with
-    others. ValueError if the folder has no usable file, or if the weights of a network or of LPIPS are missing.
-    """
+    """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     if options.weights is not None and not options.weights.is_file():
         raise ValueError(
             f"--weights {options.weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"

@@ -112,11 +112,7 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_overrides(settings: type, root: Path, overrides: list[str], presets: Path | None = None) -> None:
-    """Raise ValueError for an override of a key that `settings` lacks, or of a group that has no such choice.
-
-    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
-    lists the available keys and choices.
-    """
+    """ValueError, with those there are, for an override of an unknown key or for an unknown choice of a group."""
     _check_params(settings, root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:

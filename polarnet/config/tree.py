@@ -282,9 +282,8 @@ def typed(node: DictConfig) -> Config:
 
 
 def load(root: Path, overrides: list[str] | None = None, presets: Path | None = None) -> Config:
-    """Load the configuration of the project at `root`, outside any Hydra application.
+    """Load the configuration of the project at `root`; overrides may also choose presets from conf/ of `presets`.
 
-    Overrides may also choose presets from conf/ of the folder `presets`, which need not be a project. Raises
     ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
     """
     overrides = overrides or []
@@ -301,9 +300,7 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line that checks the configuration and sets up the runtime first.
 
-    The command refuses an unknown key or choice, a wrong type, a value out of range and an ablation that changes
-    nothing. It also refuses a configuration with LPIPS on a machine without the weights, and inputs that were made with
-    other values (`polarnet.config.origins`).
+    It also refuses LPIPS without its weights, and inputs made with other values (`polarnet.config.origins`).
     """
     root, script = _root_of(main), _file_of(main).stem
 
@@ -373,8 +370,7 @@ def _file_of(main: Callable[..., None]) -> Path:
 def with_lpips(config: Config, purpose: Purpose, use: Callable[[str, str | None], T]) -> T | None:
     """Call `use` with the LPIPS backbone and weights file for a purpose; None if the purpose needs no LPIPS.
 
-    The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
-    that turn it off.
+    A ValueError from `use` gets the keys that request LPIPS and the overrides that turn it off.
     """
     if purpose == "loss":
         backbone, off = config.lpips.backbone, "0"

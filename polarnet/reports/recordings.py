@@ -58,10 +58,9 @@ def draw_calibration(target: Calibrated, config: RecordingsConfig, path: Path) -
 
 
 def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
-    """Write the paper's Fig. 8 of a calibrated target as PATH.png and PATH.pdf.
+    """Write the paper's Fig. 8 of a calibrated target as PATH.png and PATH.pdf; a column is a time.
 
-    A column is a time. Rows are event tensors of the window before it and intensities, each at 0, 45, 90 and 135
-    degrees, and DoLP. Intensities are scaled to the brightest pixel of the sequence.
+    Intensities are scaled to the brightest pixel of the sequence.
     """
     chosen = np.linspace(1, len(frames.t_us) - 1, min(SEQUENCE_COLUMNS, len(frames.t_us) - 1)).round().astype(int)
     figure, grid = tile_grid(9, len(chosen), frames.dolp.shape[1:], bar_row=8)

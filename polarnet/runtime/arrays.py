@@ -139,10 +139,9 @@ def floats(name: str, values: Any, axes: str) -> Float[Tensor, "*shape"]:
 
 
 def fractions(name: str, values: Any, axes: str, quantity: str = "values") -> Float[Tensor, "*shape"]:
-    """Convert values in [0, 1] as `floats` does, clipping float32 rounding errors.
+    """Convert values in [0, 1] as `floats` does, clipping float32 rounding errors; the ValueError names a divisor.
 
-    Raises ValueError also for values out of range, with the number to divide by. Integers are refused even within the
-    range, because an array does not say which integer is white.
+    Integers are refused even within the range, because an array does not say which integer is white.
     """
     tensor = as_tensor(name, values).detach().cpu()
     check_shape(name, values, axes)

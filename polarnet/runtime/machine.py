@@ -82,8 +82,7 @@ def limit_threads(threads: int) -> None:
 def one_thread() -> Iterator[None]:
     """Run torch on one thread, so that its bytes do not depend on the number of threads.
 
-    Threads split an image between them. torch computes the last values of each part one by one, and rounds them
-    differently from whole vectors.
+    torch computes the last values of each thread's part one by one, and rounds them differently from whole vectors.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
