@@ -23,6 +23,23 @@ from polarnet.reports.legend import Legend, with_structure
 from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, paper_map, table_of
 from polarnet.storage.panels import NO_EVENTS, Panel
 
+Kind = Literal["events", "s0", "dolp", "aolp"]
+
+MAX_SIDE = 320  # pixels of a map's longer side; larger maps are reduced
+MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 16,383 rows of a WebP
+MAX_STRIP_BYTES = 28_000_000  # of all strips: a page with charts and tables stays below 30 MB
+QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 20}
+TRUTH = "truth"
+
+COLOURS = {
+    "events": EVENT_TABLE,
+    "s0": table_of(matplotlib.colormaps["gray"]),
+    "dolp": DOLP_TABLE,
+    "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
+    "error": table_of(matplotlib.colormaps["magma"]),
+    "paper": paper_map(torch.ones(1, 256), torch.arange(256)[None] * (torch.pi / 256))[0],  # scaled with DoLP
+}
+
 
 def template(name: str) -> Template:
     """Load a page template of this package: every value is escaped, and a missing value is an error."""
@@ -40,24 +57,6 @@ def embedded_json(content: Any) -> Markup:
 def script(name: str) -> Markup:
     """A JavaScript file of this package."""
     return Markup((files("polarnet.reports") / name).read_text(encoding="utf-8"))
-
-
-Kind = Literal["events", "s0", "dolp", "aolp"]
-
-MAX_SIDE = 320  # pixels of a map's longer side; larger maps are reduced
-MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 16,383 rows of a WebP
-MAX_STRIP_BYTES = 28_000_000  # of all strips: a page with charts and tables stays below 30 MB
-QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 20}
-TRUTH = "truth"
-
-COLOURS = {
-    "events": EVENT_TABLE,
-    "s0": table_of(matplotlib.colormaps["gray"]),
-    "dolp": DOLP_TABLE,
-    "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
-    "error": table_of(matplotlib.colormaps["magma"]),
-    "paper": paper_map(torch.ones(1, 256), torch.arange(256)[None] * (torch.pi / 256))[0],  # scaled with DoLP
-}
 
 
 class Map(NamedTuple):

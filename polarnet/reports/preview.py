@@ -1,4 +1,4 @@
-"""Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value.
+"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4.
 
 `plot_events`, `plot_frame` and `plot_prediction` return pictures that a notebook shows and that `save` writes.
 """
@@ -37,6 +37,16 @@ CODEC, PIXELS = "libx264", "yuv420p"  # the one pair that every browser plays
 QUALITY = {"preset": "ultrafast", "crf": "18", "threads": "1"}  # a second thread would take the network's core
 LAYOUT = {"movflags": "hybrid_fragmented", "flush_packets": "1"}  # plays after a kill, an ordinary MP4 once closed
 SECONDS_PER_FRAGMENT = 2  # the most that a kill loses
+MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
+GAP, MARGIN = 8, 12
+FONT_SIZE = 13  # pixels
+LINE = 22  # height of a line of text
+BAR = (120, 10)  # width and height of the colour bar of DoLP
+TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
+EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
+
+Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
+"""Maps of a row of a sheet, by caption."""
 
 
 class VideoWriter:
@@ -91,18 +101,6 @@ def with_even_sides(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h
     """The picture with its last row and column repeated where a side is odd, because codecs want even sides."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
-GAP, MARGIN = 8, 12
-FONT_SIZE = 13  # pixels
-LINE = 22  # height of a line of text
-BAR = (120, 10)  # width and height of the colour bar of DoLP
-TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
-EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
-
-Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
-"""Maps of a row of a sheet, by caption."""
 
 
 class Sheet:
