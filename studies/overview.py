@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from torch import Tensor
@@ -163,27 +164,37 @@ def _source(figure: Figure, x: float, overview: Overview) -> None:
         axes.plot(*line, color="black", linewidth=2.4, alpha=0.6)
         axes.plot(*line, color="white", linewidth=1.2)
     axes.set(xlim=(0, columns), ylim=(rows, 0))
-    draw_wheel(figure, (x + 0.4) / figure.get_figwidth(), 1.0 / HEIGHT, 1.2 / figure.get_figwidth(), 1.2 / HEIGHT)
+    _wheel(_place(figure, x + 0.4, 1.0, 1.2, 1.2))
     text = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
     style: dict[str, Any] = {"color": LIGHT.quiet, "fontsize": 9.5, "ha": "center", "va": "center", "linespacing": 1.5}
     _text(figure, x + PICTURE_WIDTH / 2, 0.52, text, **style)
 
 
-def draw_wheel(figure: Figure, *place: float) -> None:
-    """Draw the legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1.
+def _wheel(axes: Axes) -> None:
+    """Draw `hue_wheel`, labelled with AoLP at 0, 45, 90 and 135 degrees."""
+    axes.imshow(hue_wheel(480))
+    axes.axis("off")
+    for angle, (across, up, sideways, upright) in {
+        "0°": (1.05, 0.5, "left", "center"), "45°": (0.87, 0.88, "left", "bottom"),
+        "90°": (0.5, 1.03, "center", "bottom"), "135°": (0.13, 0.88, "right", "bottom"),
+    }.items():  # fmt: skip
+        place: dict[str, Any] = {"transform": axes.transAxes, "ha": sideways, "va": upright}
+        axes.text(across, up, angle, color=LIGHT.quiet, fontsize=9.0, **place)
 
-    Opposite points have the same colour, since both directions of a line are one angle of polarization.
+
+def hue_wheel(size: int) -> UInt8[np.ndarray, "size size 4"]:
+    """The legend of `polarization_hsv`: direction is AoLP, radius is DoLP, value 1. RGBA, transparent outside.
+
+    Opposite points have the same colour, since both directions of a line are one angle of polarization. Angles count
+    anticlockwise from the right, as on paper; the first row is the top.
     """
-    axes = figure.add_axes(place, projection="polar")
-    direction, radius = np.meshgrid(np.linspace(0, 2 * math.pi, 721), np.linspace(0, 1, 129))
-    angle, degree = torch.from_numpy(direction), torch.from_numpy(radius)
-    colours = polarization_hsv(torch.ones_like(degree), degree, angle)
-    axes.pcolormesh(direction, radius, colours, shading="nearest", rasterized=True)
-    axes.set_thetagrids(POLARIZER_ANGLES_DEG, [f"{angle}°" for angle in POLARIZER_ANGLES_DEG])
-    axes.set_yticks([])
-    axes.grid(visible=False)
-    axes.spines["polar"].set_visible(False)
-    axes.tick_params(pad=-2, labelsize=9, colors=LIGHT.quiet)
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(axis, -axis)
+    radius = np.hypot(x, y)
+    hue = np.arctan2(y, x) / math.pi % 1.0
+    rgb = hsv_to_rgb(np.stack([hue, radius.clip(0, 1), np.ones_like(hue)], axis=-1))
+    edge = ((1 - radius) * size / 2).clip(0, 1)  # soft rim, one pixel wide
+    return np.rint(255 * np.concatenate([rgb, edge[..., None]], axis=-1)).astype(np.uint8)
 
 
 def _arrow(figure: Figure, x: float, text: str) -> float:

@@ -9,7 +9,7 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.panels import Panel, Shown, fraction_bytes
 from polarnet.storage.scenes import SceneStore
-from studies.overview import MAX_EVENTS, overview_figure, overview_of_panel
+from studies.overview import MAX_EVENTS, hue_wheel, overview_figure, overview_of_panel
 
 WINDOW = 3
 
@@ -50,3 +50,13 @@ def test_the_outline_has_the_size_of_the_sensor_and_lies_on_the_picture(overview
 
 def test_the_overview_has_the_same_bytes_each_time(overview):
     assert png(overview_figure(overview)) == png(overview_figure(overview))
+
+
+@pytest.mark.parametrize(
+    ("direction_deg", "colour"),
+    [(0, (255, 0, 0)), (60, (0, 255, 0)), (120, (0, 0, 255)), (180, (255, 0, 0)), (240, (0, 255, 0))],
+)
+def test_the_wheel_shows_at_each_direction_the_colour_of_that_angle(direction_deg, colour):
+    middle, radius, angle = 200, 196, np.radians(direction_deg)
+    place = middle - round(radius * np.sin(angle)), middle + round(radius * np.cos(angle))
+    assert hue_wheel(401)[place][:3].astype(int) == pytest.approx(colour, abs=10)
