@@ -19,10 +19,7 @@ def main(config: Config) -> None:
         print("recordings.enabled is false")
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}
-    try:
-        targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
+    targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
     events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
     for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")

@@ -9,9 +9,8 @@ from typing import Any
 from polarnet.config.pipeline import set_folder
 from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.artefacts import ReportPaths, read_results, results_table
+from polarnet.reports.artefacts import ReportPaths, Run, facts, read_results, results_table
 from polarnet.reports.page import write_report
-from polarnet.reports.provenance import Run, facts
 from polarnet.reports.tables import as_plain
 
 PLUMBING = ("networks", "rows", "row", "baseline", "paths", "runtime", "cluster")
@@ -26,10 +25,7 @@ def plain(value: Any) -> Any:
 @hydra_stage
 def main(config: Config) -> None:
     """Put the tables together from the rows of `benchmark.methods`, write the report and print its location."""
-    try:
-        tables = collect_rows(config)
-    except FileNotFoundError as error:
-        raise SystemExit(str(error)) from None
+    tables = collect_rows(config)
     copy_histories(config)
     for name in tables:
         print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))

@@ -1,12 +1,9 @@
 """One point of a sweep: train and benchmark in the job's own folder, without touching the files that DVC tracks.
 
 `python -m stages.trial -m loss.mse=1.0 loss.ssim=0.0,1.0 seed=1,2,3` runs every combination and ends with one table
-(polarnet.config.sweep). A point uses the pipeline's sequences where they were made with its values; a point with other
-values of the simulation, such as `-m emulate.contrast_threshold_on=0.1,0.2`, makes its own. Jobs may run in parallel.
-
-A failed point writes the reason to `failure.txt`; the other points continue. The same command with the same
-`hydra.sweep.dir` continues a sweep: a point runs again unless all of its values and inputs, and the code, are those of
-today.
+(polarnet.config.sweep). A point uses the pipeline's sequences where they were made with its values, and else makes its
+own. A failed point writes the reason to `failure.txt`; the others continue. The same command with the same
+`hydra.sweep.dir` runs a point again unless its values, its inputs and the code are those of today.
 """
 
 import dataclasses

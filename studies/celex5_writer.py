@@ -47,7 +47,9 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
     row, column = events.y.numpy().astype(np.int64), events.x.numpy().astype(np.int64)
     p = events.p.numpy()
-    first_is_darker = _first_is_darker(row * WIDTH + column, p)
+    first_is_darker = np.zeros(len(p), np.bool_)
+    first_is_darker[np.unique(row * WIDTH + column, return_index=True)[1]] = True
+    first_is_darker &= p < 0
     stamp = np.concatenate([np.zeros(first_is_darker.sum(), np.int64), stamp])
     row, column = (np.concatenate([values[first_is_darker], values]) for values in (row, column))
     p = np.concatenate([np.ones(first_is_darker.sum(), np.int8), p])
@@ -121,12 +123,6 @@ def _packed_picture(picture: np.ndarray) -> np.ndarray:
     return np.stack([dark[:, 0] >> 4, dark[:, 1] >> 4, low], axis=1).astype(np.uint8)
 
 
-def _first_is_darker(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> np.ndarray:
-    first = np.zeros(len(p), np.bool_)
-    first[np.unique(pixel, return_index=True)[1]] = True
-    return first & (p < 0)
-
-
 def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndarray, " n"]:
     """An intensity from 1 to 4095 for each event, above or below that of the pixel's previous event."""
     order = np.argsort(pixel, kind="stable")
@@ -143,11 +139,7 @@ def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndar
 
 
 def _stamps(stamp: np.ndarray, announced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps to send, and the index of the event that each precedes.
-
-    The stamps are close enough to stay unambiguous when they wrap. The first is 0; one comes before each of the
-    `announced` events.
-    """
+    """Time stamps to send, from 0 and close enough to stay unambiguous; and the index of the event behind each."""
     step = 2**15
     sent = stamp[announced]
     before = np.concatenate([[0], sent[:-1]])[: len(sent)]

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 from PIL import Image
 
 from polarnet.config.sweep import sweep_points
+from polarnet.reports.artefacts import git
 from polarnet.reports.maps import png
-from polarnet.reports.provenance import git
 from studies.overview import overview_figure, overview_of
 from studies.study import (
     PICTURES,
@@ -100,9 +100,8 @@ def run_study(name: str, given: Mapping[str, Any]) -> None:
 def measure_pipeline(root: Path = ROOT) -> Path:
     """Clone HEAD of the project at `root`, time its set-up, `make repro` and `make test`; write pipeline.json.
 
-    The overview picture of the README, `dvc.lock` and `data/benchmark/metrics.json` come from the same run, so that
-    `dvc metrics diff` has numbers to compare with in every clone. Raises RuntimeError if a command fails, if a second
-    `make repro` runs a stage, or if the tree has uncommitted changes.
+    The README's overview, `dvc.lock` and the demo's metrics come from the same run. RuntimeError if a command fails, a
+    second `make repro` runs a stage, or the tree has uncommitted changes.
     """
     if uncommitted(root):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -148,10 +147,9 @@ def timed_make(target: str, folder: Path) -> tuple[float, dict[str, float]]:
 
 
 def measure_ablation(sweep: Path, root: Path = ROOT) -> Path:
-    """Write section `ablation` of docs/results/network.json from a sweep over the files of conf/ablation.
+    """Write section `ablation` of docs/results/network.json from a sweep over conf/ablation, without failed jobs.
 
-    Failed jobs are left out. RuntimeError if a job has no `ablation=NAME`, or if the reference `ablation=nothing` is
-    missing.
+    RuntimeError if a job has no `ablation=NAME`, or if the reference `ablation=nothing` is missing.
     """
     rows: dict[str, dict[str, Any]] = {}
     for point in sweep_points(sweep):

@@ -1,7 +1,7 @@
 """Train every network on the same photographs, and score every method on photographs that none of them saw.
 
 python -m studies.peers --photographs FOLDER --work FOLDER
-    [--ours FILE] [--published ROW=FILE ...] [--override ROW:KEY=VALUE ...] [--write]
+    [--ours FILE] [--published ROW=FILE ...] [--write]
 
 The study runs the pipeline's stages with experiment=photographs in the folder --work. An interrupted run resumes, and
 finished trainings are reused. The split is by source picture. --write puts the scores into docs/results/benchmark.json
@@ -60,9 +60,8 @@ def trained(row: str, arguments: argparse.Namespace) -> Path:
     weights = root / ("ours" if row == "paper" else row) / "best.safetensors"
     resume = arguments.work / "resume" / row
     if not weights.exists() or any(resume.glob("*/running.pt")):
-        own = [pair for of_row, _, pair in (one.partition(":") for one in arguments.override) if of_row == row]
         paths = (f"paths.train={root}", f"paths.resume={resume}", f"benchmark.methods=[{row}]")
-        run_stage("train", *common(arguments), *TRAININGS[row], *paths, *own)
+        run_stage("train", *common(arguments), *TRAININGS[row], *paths)
     return weights
 
 
@@ -97,26 +96,17 @@ def draw_event_budget(arguments: argparse.Namespace, weights: Path) -> None:
     shutil.copy(out / "event_budget.png", PICTURES / "event_budget.png")
 
 
-def parsed() -> argparse.Namespace:
-    """The command line."""
+def main() -> None:
+    """Train, benchmark, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/benchmark.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--ours", type=Path, help="weights of `ours`, such as the shipped ones, instead of training it")
     parser.add_argument("--published", nargs="+", default=[], metavar="ROW=FILE", help=f"of {', '.join(PUBLISHED)}")
-    parser.add_argument(
-        "--override", action="append", default=[], metavar="ROW:KEY=VALUE", help="value for the training of one row"
-    )
     parser.add_argument("--threads", type=int, default=0, help="0: all cores")
     arguments = arguments_of(parser)
     pairs = [given.partition("=") for given in arguments.published]
     arguments.published = {row: Path(file).resolve() for row, _, file in pairs if row in PUBLISHED}
-    return arguments
-
-
-def main() -> None:
-    """Train, benchmark, print and perhaps write."""
-    arguments = parsed()
     record = machine_record()
     if not (arguments.work / "data" / "events.zarr").exists():
         for name in ("ingest", "synthesize", "emulate"):

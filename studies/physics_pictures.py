@@ -17,7 +17,6 @@ from torch import Tensor
 
 from polarnet.config.tree import load
 from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events
 from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image
@@ -38,7 +37,7 @@ from polarnet.stokes import (
     stokes_from_polarization,
 )
 from studies.overview import OFF, ON
-from studies.simulation_pictures import LINE, QUIET, drawn, photograph, write_pictures
+from studies.simulation_pictures import LINE, QUIET, drawn, events_under, photograph, write_pictures
 from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
@@ -47,21 +46,13 @@ WRONG_FACTORS = (1.0, 0.7, 1.4, 1.1)  # of the intensities behind 0, 45, 90 and 
 NOISE = 0.02  # relative standard deviation of the intensities
 DARKEST = 0.004  # of white; added behind every polarizer, as stray light
 STILL = Sine(0.0, 0.0, 0.0)
+SWING = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
 PALETTE = 256  # colours of a picture on disk
 CONSTANT_SPEED_PX_S = 97.3
 FLAT_HEIGHT, FLAT_WIDTH = 40, 200
 SETTLING_FRAMES = 6  # until each pixel has fired, and its memory is that of an endless motion
 SIZE = (200, 300)  # rows and columns of the sensor behind the presets
 LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
-
-
-def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
-                 pixels: int = 1, eight_bit: bool = False) -> Events:  # fmt: skip
-    """Events of neighbouring pixels under one light."""
-    frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
-    frames = frames.round().to(torch.uint8) if eight_bit else frames
-    (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=5)
-    return events
 
 
 @drawn(9.0, 5.4)
@@ -89,12 +80,10 @@ def _draw_photoreceptor(axes: Axes) -> None:
     t_us = np.arange(0, 60_001, 100.0)
     for light_dn, colour in zip((200.0, 60.0, 15.0), COLOURS, strict=False):
         light = np.where(t_us < 5_000, light_dn / 1.25, light_dn)
-        low, high = np.array([light_dn / 1.25], np.float32), np.array([light_dn], np.float32)
-        ends = np.empty((2, 1), np.float32)
-        linlog(low, ends[0])
-        linlog(high, ends[1])
+        ends = np.empty(2, np.float32)
+        linlog(np.array([light_dn / 1.25, light_dn], np.float32), ends)
         events = events_under(light, t_us, config)
-        t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1, 0] - ends[0, 0])
+        t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1] - ends[0])
         axes.step(np.r_[0, t_ms, 60], np.r_[0, rise, rise[-1:]], where="post", color=colour, linewidth=1.2)
         axes.text(58, 1.12 - 0.12 * (200.0, 60.0, 15.0).index(light_dn) - 0.45, f"{light_dn:g} DN", color=colour,
                   ha="right", fontsize=8)  # fmt: skip
@@ -121,19 +110,15 @@ def _draw_mismatch(axes: Axes) -> None:
 
 def _draw_noise(axes: Axes) -> None:
     """Events in constant light, against its brightness."""
-    shot = replace(QUIET, shot_noise_rate_hz=5.0)
-    leak = replace(QUIET, leak_rate_hz=1.0)
     seconds, pixels = 20, 500
     t_us = np.array([0.0, seconds * 1e6])
-    points: dict[str, list[float]] = {"shot noise, ON": [], "shot noise, OFF": [], "leak, ON": []}
-    for light_dn in LIGHTS_DN:
-        light = np.full(2, float(light_dn))
-        noise, leaked = events_under(light, t_us, shot, pixels), events_under(light, t_us, leak, pixels)
-        points["shot noise, ON"].append(float((noise.p > 0).sum()) / pixels / seconds)
-        points["shot noise, OFF"].append(float((noise.p < 0).sum()) / pixels / seconds)
-        points["leak, ON"].append(float((leaked.p > 0).sum()) / pixels / seconds)
-        assert not (leaked.p < 0).any()
-    for (label, rates), colour, marker in zip(points.items(), (ON, OFF, COLOURS[3]), "^vo", strict=True):
+    shot, leak = replace(QUIET, shot_noise_rate_hz=5.0), replace(QUIET, leak_rate_hz=1.0)
+    for label, config, sign, colour, marker in (
+        ("shot noise, ON", shot, 1, ON, "^"), ("shot noise, OFF", shot, -1, OFF, "v"),
+        ("leak, ON", leak, 1, COLOURS[3], "o"),
+    ):  # fmt: skip
+        fired = [events_under(np.full(2, float(light)), t_us, config, pixels).p == sign for light in LIGHTS_DN]
+        rates = [float(one.sum()) / pixels / seconds for one in fired]
         axes.plot(LIGHTS_DN, rates, marker, color=colour, markersize=4, label=label)
     light = np.linspace(0, 255, 50)
     axes.plot(light, 2.5 * (1 - 0.75 * (light + 20) / 275), color=LIGHT.quiet, linewidth=1, label="v2e's formula")
@@ -216,17 +201,13 @@ def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float
     return channel_light(light, polarizers, weights_of(polarizers, *SIZE, key=1))[:, 0].astype(np.float64) / 255
 
 
-def true_stokes(scene: PolarizationScene) -> Float64[Tensor, "3 h w"]:
-    """Stokes parameters of the scene under the same sensor."""
-    top, left = (scene.height - SIZE[0]) // 2, (scene.width - SIZE[1]) // 2
-    return scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
-
-
 @drawn(9.0, 2.8)
 def readout_figure(figure: Figure) -> None:
     """Draw the times of a flash by row, and a bus whose limit the events exceed."""
     rows, rate, waits = figure.subplots(1, 3)
-    flash = _flash()
+    t_us = torch.tensor([0.0, 5_000.0, 5_001.0, 30_000.0], dtype=torch.float64)
+    card = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
+    (flash,), _ = emulate(card, t_us, QUIET, key=1)  # a grey card becomes brighter at 5 ms
     for readout, colour, label in (
         (PERFECT, LIGHT.quiet, "perfect"),
         (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
@@ -237,7 +218,7 @@ def readout_figure(figure: Figure) -> None:
     rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
     rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
     rows.set_title("a flash on 60 rows", loc="left", fontsize=9)
-    swing = _swing()
+    swing = emulate_motion(Camera(SENSORS["default"], key=1), photograph(), SWING, 1_000_000, (60, 80))[0]
     limit_hz = 1e5
     limited, lost = read_out(
         swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
@@ -259,19 +240,6 @@ def readout_figure(figure: Figure) -> None:
     waits.set(xlabel="mean rate / limit", ylabel="events lost", ylim=(0, None))
     waits.legend(fontsize=7, frameon=False)
     waits.set_title("loss against load", loc="left", fontsize=9)
-
-
-def _flash() -> Events:
-    """A grey card that becomes brighter at 5 ms, seen by 60 x 80 pixels."""
-    t_us = np.array([0.0, 5_000.0, 5_001.0, 30_000.0])
-    light = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
-    (events,), _ = emulate(light, torch.from_numpy(t_us), QUIET, key=1)
-    return events
-
-
-def _swing() -> Events:
-    path = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
-    return emulate_motion(Camera(SENSORS["default"], key=1), photograph(), path, 1_000_000, (60, 80))[0]
 
 
 def periodic_scene(columns: int) -> PolarizationScene:
@@ -342,7 +310,9 @@ def _behind(degree: float, angle_deg: float) -> float:
 @drawn(7.2, 2.0)
 def gains_figure(figure: Figure) -> None:
     """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
-    truth = true_stokes(photograph())
+    scene = photograph()
+    top, left = (scene.height - SIZE[0]) // 2, (scene.width - SIZE[1]) // 2
+    truth = scene.stokes[:, top : top + SIZE[0], left : left + SIZE[1]].double()
     noise = 1 + NOISE * torch.randn((4, *truth.shape[1:]), generator=torch.Generator().manual_seed(1))
     measured = (intensities_from_stokes(truth) + DARKEST) * noise
     wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]

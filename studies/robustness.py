@@ -5,23 +5,16 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
     [--limit N] [--write]
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
-- `photographs`: a split of the pipeline's (`experiment=photographs`) of the folder --photographs.
-- `photographs_large`: the same splits of --photographs and of --photographs-large together.
-- `measured.SOURCE`: all measured scenes of one source. A folder with a manifest.csv (columns file, repo) has one source
-  for each repo; any other folder is one source.
-- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS. `ours, thresholds given` is told the contrast
-  thresholds of the sensor (`methods.ours.thresholds`).
-- `time.5ms`: the scenes of the sensors with windows of 5 ms.
+- `photographs`: a split (`experiment=photographs`) of --photographs; `photographs_large`: of both folders together.
+- `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
+- `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 
-Under each condition, `ours, 2x2 blocks` is the network on blocks of pixels (`methods.ours.binning=2`).
-
-Nothing is trained, except the constants: `train_mean` is the mean DoLP of the training photographs, and `constant_real`
-the mean DoLP of the measured scenes of all sources but the one that is scored. --split val is for choices and --split
-test for figures. --limit takes the first N pictures of each set; --sensor-limit of the sensors alone. Events are
-simulated in memory, and pictures are kept in --work. --write puts the scores into docs/results/robustness.json.
-
-The second command scores nothing. It fills --training with links to the training photographs of both folders. A
-network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
+`ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
+`train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
+sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
+--sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
+docs/results/robustness.json. The second command fills --training with links to the training photographs of both
+folders: a network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
 """
 
 import argparse
@@ -122,15 +115,6 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
     return conditions | {"time.5ms": [(small, ("synthesize.frame_rate_hz=200",))]}
 
 
-def selected(conditions: Mapping[str, Condition], wanted: Sequence[str] | None) -> dict[str, Condition]:
-    """The conditions whose names, or the beginnings of whose names, are `wanted`; None: all."""
-    return {
-        name: parts
-        for name, parts in conditions.items()
-        if wanted is None or any(name == one or name.startswith(f"{one}.") for one in wanted)
-    }
-
-
 def contexts_of(
     condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
 ) -> dict[str, Context]:
@@ -141,14 +125,13 @@ def contexts_of(
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
-    first = next(iter(weights.values()))
-    return contexts | {
-        row: context_of(settings(*overrides, variant), [OURS], train_mean, first) for row, variant in variants.items()
-    }
+    for row, variant in variants.items():
+        contexts[row] = context_of(settings(*overrides, variant), [OURS], train_mean, next(iter(weights.values())))
+    return contexts
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+    scenes: SceneStore, config: Config, contexts: Mapping[str, Context], name: str, constant: float
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
@@ -189,7 +172,7 @@ def warmup_windows(config: Config) -> int:
 
 def table_of(scores: Scores) -> dict[str, Any]:
     """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
-    errors, psnr, level, corr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr", "level_mse", "corr"))
+    errors, psnr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr"))
     oracle = errors["oracle_mean"]
     table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
     for row, of_scene in errors.items():
@@ -198,9 +181,7 @@ def table_of(scores: Scores) -> dict[str, Any]:
             "mse": mse,
             "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
-            "level_mse": statistics.fmean(level[row].values()),
             "psnr": statistics.fmean(psnr[row].values()),
-            "corr": statistics.fmean(corr[row].values()),
         }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
@@ -246,10 +227,8 @@ def tables_of(
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
-            config, contexts = (
-                settings(*common, *overrides),
-                contexts_of(name, (*common, *overrides), train_mean, weights),
-            )
+            config = settings(*common, *overrides)
+            contexts = contexts_of(name, (*common, *overrides), train_mean, weights)
             scenes = scenes_of(images, config)
             task = functools.partial(
                 scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant
@@ -264,8 +243,8 @@ def tables_of(
     return tables
 
 
-def parsed() -> argparse.Namespace:
-    """The command line."""
+def main() -> None:
+    """Score, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/robustness.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--photographs-large", type=Path, help="further photographs")
@@ -283,12 +262,7 @@ def parsed() -> argparse.Namespace:
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
-    return arguments
-
-
-def main() -> None:
-    """Score, print and perhaps write."""
-    arguments, record = parsed(), machine_record()
+    record = machine_record()
     common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
     for row, _, file in (given.partition("=") for given in arguments.published):
         common.append(row_of(row, Path(file)))
@@ -308,14 +282,16 @@ def main() -> None:
         if name.startswith("measured.")
     }
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    tables = tables_of(selected(conditions, arguments.conditions), means, train_mean, arguments.weights, common)
-    figures = headlines(tables, next(iter(arguments.weights)))
-    print(json.dumps(figures, indent=1))
+    if wanted := arguments.conditions:
+        conditions = {
+            name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
+        }
+    tables = tables_of(conditions, means, train_mean, arguments.weights, common)
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
-        write_section("robustness", arguments.split, section, record, figures if arguments.split == "test" else None)
+        write_section("robustness", arguments.split, section, record)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,10 @@
 """A simulated rig (paper, section 4): a scene moves across a CeleX-5 eight times, giving eight files with their truth.
 
-The module imports `simulation`, which makes the light and the events, and `recordings`, which knows the file formats.
-Those two packages never import each other. The readers of the files know nothing of this module.
-
-The scene drifts from right to left at constant speed. A bright stripe runs above it, and a dark landmark enters on the
-stripe from the right. Until then the region in the upper right corner is bright. Each capture starts at a random time
-before the landmark.
+The scene drifts from right to left. A bright stripe runs above it, and a dark landmark enters on the stripe from the
+right. Each capture starts at a random time before the landmark.
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -24,7 +19,8 @@ from torch import Tensor
 
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
-from polarnet.events.stream import Events, merge
+from polarnet.events.stream import Events, merge, select
+from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.runtime.sections import one_of, section
@@ -95,10 +91,9 @@ def write_rig(
     seed: int,
     threads: int = 1,
 ) -> RigTruth:
-    """Write the eight captures of a target into `folder`, with truth.json and truth.npz, and return the truth.
+    """Write the eight captures of a target into `folder`, and return the truth; seed and folder name decide all chance.
 
-    `picture` is enlarged to the area that the moving sensor sees. All random values depend on the seed and the folder's
-    name only.
+    `picture` is enlarged to the area that the moving sensor sees.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -113,16 +108,13 @@ def write_rig(
 
     camera = Camera(emulator, key=seed_for(seed, name, "emulate"))
     channels = emulate_motion(camera, scene, path, total_us, (height, width), threads)
-    hot = _random_pixels(config.hot_pixels, recordings, generator)
+    places = (generator.integers(0, side, config.hot_pixels).tolist() for side in recordings.sensor)
+    hot = frozenset(zip(*places, strict=True))
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
         begin_us = landmark_us - start_us[capture]
-        later = noisy.t >= begin_us
-        capture_events = Events(
-            noisy.t[later] - begin_us, noisy.x[later], noisy.y[later], noisy.p[later], height, width
-        )  # fmt: skip
         write = write_celex5_bin if config.file_type == "bin" else write_celex5_csv
-        write(folder / f"{capture}.{config.file_type}", capture_events)
+        write(folder / f"{capture}.{config.file_type}", shifted(select(noisy, noisy.t >= begin_us), begin_us))
     for polarizer, capture in enumerate(INTENSITY_CAPTURES):
         begin_us = landmark_us - start_us[capture]
         count = int((total_us - begin_us) * 1e-6 * config.picture_rate_hz)
@@ -131,9 +123,7 @@ def write_rig(
         pictures = _pictures(scene, path, t_us + begin_us, polarizer, config, recordings, generator)
         write_celex5_pictures(folder / f"{capture}.bin", pictures, t_us.tolist())
 
-    truth = RigTruth(start_us, hot, scene, path, landmark_us)
-    _write_truth(folder, truth, config, recordings)
-    return truth
+    return RigTruth(start_us, hot, scene, path, landmark_us)
 
 
 def rig_scene(
@@ -210,13 +200,6 @@ def _pictures(
         yield whole
 
 
-def _random_pixels(
-    count: int, recordings: RecordingsConfig, generator: np.random.Generator
-) -> frozenset[tuple[int, int]]:
-    rows, columns = (generator.integers(0, side, count).tolist() for side in recordings.sensor)
-    return frozenset(zip(rows, columns, strict=True))
-
-
 def _hot_events(
     hot: frozenset[tuple[int, int]], total_us: int, height: int, width: int, generator: np.random.Generator
 ) -> Events:
@@ -229,23 +212,7 @@ def _hot_events(
     order = np.argsort(t, kind="stable")
     p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
     y, x = np.ascontiguousarray(yx[order].T)
-    from_numpy = torch.from_numpy
-    return Events(from_numpy(t[order]), from_numpy(x), from_numpy(y), from_numpy(p), height, width)
-
-
-def _write_truth(folder: Path, truth: RigTruth, config: RigConfig, recordings: RecordingsConfig) -> None:
-    count = int(config.duration_s * recordings.frame_rate_hz) + 1
-    t_us = np.rint(np.arange(count) * 1e6 / recordings.frame_rate_hz).astype(np.int64)
-    dolp = true_dolp(truth, t_us, recordings).numpy()
-    np.savez(folder / "truth.npz", t_us=t_us, dolp=dolp)
-    content = {
-        "start_us": dict(truth.start_us),
-        "speed_px_s": config.speed_px_s,
-        "hot_pixels": sorted(truth.hot),
-        "mean_dolp": round(float(dolp.mean()), 6),
-        "dolp": "truth.npz: t_us from the landmark on, dolp of each of these times",
-    }
-    (folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n")
+    return Events(*map(torch.from_numpy, (t[order], x, y, p)), height, width)
 
 
 def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:

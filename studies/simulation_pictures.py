@@ -6,12 +6,11 @@ Every line and every event in them comes from the simulation itself.
 import argparse
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float64
@@ -19,10 +18,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.representations import polarity_sums
+from polarnet.events.stream import Events, select, slice_time
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
-from polarnet.reports.figures import LIGHT, chart_style, show_picture
+from polarnet.reports.figures import LIGHT, show_picture, styled
 from polarnet.reports.maps import event_image, png
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig, emulate
@@ -33,7 +33,7 @@ from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from studies.overview import OFF, ON
 
 FOLDER = Path("docs") / "pictures"
-PHOTO = "coffee.png"
+PHOTO = next(photo.path for photo in BUILTIN_PHOTOS if photo.file == "coffee.png")
 DURATION_MS = 500
 RATE_HZ = 2000.0  # sampling rate of the light on the pixel
 PIXELS = 12  # number of pixels side by side under the same light, to show their differences
@@ -43,22 +43,15 @@ COLOURS = 96  # palette size of a picture on disk
 LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
 
 
-class Variation(NamedTuple):
-    """A parameter of the pixel, and its values in a picture."""
-
-    title: str
-    name: str
-    values: tuple[float, ...]
-    unit: str
-
-
-VARIATIONS = (
-    Variation("contrast threshold", "contrast_threshold", (0.1, 0.2, 0.4), ""),
-    Variation("photoreceptor bandwidth", "cutoff_hz", (0.0, 100.0, 20.0), " Hz"),
-    Variation("refractory period", "refractory_period_us", (0.0, 5_000.0, 30_000.0), " µs"),
-    Variation("leak", "leak_rate_hz", (0.0, 5.0, 20.0), " Hz"),
-    Variation("shot noise", "shot_noise_rate_hz", (0.0, 20.0, 80.0), " Hz"),
-)
+THRESHOLDS = ("contrast_threshold_on", "contrast_threshold_off")
+VARIATIONS = {
+    "contrast threshold": (THRESHOLDS, (0.1, 0.2, 0.4), ""),
+    "photoreceptor bandwidth": (("cutoff_hz",), (0.0, 100.0, 20.0), " Hz"),
+    "refractory period": (("refractory_period_us",), (0.0, 5_000.0, 30_000.0), " µs"),
+    "leak": (("leak_rate_hz",), (0.0, 5.0, 20.0), " Hz"),
+    "shot noise": (("shot_noise_rate_hz",), (0.0, 20.0, 80.0), " Hz"),
+}
+"""Parameters of the pixel, and their values and unit in a picture."""
 SETTINGS: Mapping[str, dict[str, Any]] = {
     "noiseless": {},
     "threshold 0.1": {"contrast_threshold_on": 0.1, "contrast_threshold_off": 0.1},
@@ -89,10 +82,10 @@ def drawn(width: float, height: float) -> Callable[[Callable[[Figure], None]], C
     """Decorator: `draw(figure)` becomes a function that returns the figure, in the style of docs; sizes in inches."""
 
     def of(draw: Callable[[Figure], None]) -> Callable[[], Figure]:
+        @styled(LIGHT)
         def make() -> Figure:
-            with matplotlib.rc_context(chart_style(LIGHT)):
-                figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
-                draw(figure)
+            figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
+            draw(figure)
             return figure
 
         return make
@@ -111,12 +104,19 @@ def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, 
     return ((t_ms - at_ms) / 6).clip(0, 1)
 
 
+def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
+                 pixels: int = 1, key: int = 5, eight_bit: bool = False) -> Events:  # fmt: skip
+    """Events of neighbouring pixels under one light."""
+    frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
+    frames = frames.round().to(torch.uint8) if eight_bit else frames
+    (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=key)
+    return events
+
+
 def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int = 1) -> Events:
     """Events of neighbouring pixels under the light of `light_of_one_pixel`."""
     t_us = np.rint(np.arange(1 + DURATION_MS * 1e-3 * rate_hz) * 1e6 / rate_hz)
-    frames = torch.from_numpy(light_of_one_pixel(t_us / 1000).astype(np.float32))
-    (events,), _ = emulate(frames[:, None, None, None].expand(-1, 1, 1, pixels), torch.from_numpy(t_us), config, key=3)
-    return events
+    return events_under(light_of_one_pixel(t_us / 1000), t_us, config, pixels, key=3)
 
 
 @drawn(9.0, 5.2)
@@ -124,18 +124,19 @@ def parameters_figure(figure: Figure) -> None:
     """Draw one pixel's events for several values of each physical parameter."""
     t_ms = np.linspace(0, DURATION_MS, 2001)
     panels = figure.subplots(2, 3, sharex=True).ravel()
-    for axes, variation in zip(panels, VARIATIONS, strict=False):
-        _light(axes, t_ms, variation.title)
-        for row, value in enumerate(variation.values):
-            _ticks(axes, pixel_events(_with(QUIET, variation.name, value)), row)
-        off = "∞ Hz" if variation.name == "cutoff_hz" else f"0{variation.unit}"
-        _rows(axes, [f"{value:g}{variation.unit}" if value else off for value in variation.values])
+    for axes, (title, (names, values, unit)) in zip(panels, VARIATIONS.items(), strict=False):
+        _light(axes, t_ms, title)
+        for row, value in enumerate(values):
+            changed: dict[str, Any] = dict.fromkeys(names, value)
+            _ticks(axes, pixel_events(replace(QUIET, **changed)), row)
+        off = "∞ Hz" if "cutoff_hz" in names else f"0{unit}"
+        labels = [f"{value:g}{unit}" if value else off for value in values]
+        axes.set_yticks([row + 0.4 for row in range(len(values))], labels)
     _light(panels[-1], t_ms, "mismatch 0.05: twelve pixels, one light")
-    events = pixel_events(
-        replace(QUIET, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05), pixels=PIXELS
-    )
+    mismatched = replace(QUIET, contrast_threshold_sigma_on=0.05, contrast_threshold_sigma_off=0.05)
+    events = pixel_events(mismatched, pixels=PIXELS)
     for pixel in range(PIXELS):
-        _ticks(panels[-1], _of_pixel(events, pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
+        _ticks(panels[-1], select(events, events.x == pixel), 3 * pixel / PIXELS, 2.4 / PIXELS)
     panels[-1].set_yticks([])
     for axes in panels[3:]:
         axes.set_xlabel("ms")
@@ -173,13 +174,12 @@ def window_figure(figure: Figure) -> None:
     scene = photograph()
     motion = replace(MOTIONS["default"], sensor_height=100, sensor_width=150, speed_min_px_s=150.0)
     trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
-    columns, rows = 4, 3
-    panels = figure.subplots(rows, columns).ravel()
-    for axes, (label, changes) in zip(panels, SETTINGS.items(), strict=True):
-        config = replace(QUIET, **changes)
-        events = emulate_motion(Camera(config, key=1), scene, trajectory, WINDOW_US[1], (100, 150))[0]
+    for axes, (label, changes) in zip(figure.subplots(3, 4).ravel(), SETTINGS.items(), strict=True):
+        events = emulate_motion(Camera(replace(QUIET, **changes), key=1), scene, trajectory, WINDOW_US[1], (100, 150))[
+            0
+        ]
         window = slice_time(events, *WINDOW_US)
-        show_picture(axes, event_image(_counts(window), 3.0), LIGHT)
+        show_picture(axes, event_image(polarity_sums(window), 3.0), LIGHT)
         axes.set_title(label, loc="left", fontsize=9)
         axes.set_xlabel(f"{len(window):,} events", color=LIGHT.quiet, fontsize=7)
 
@@ -187,13 +187,11 @@ def window_figure(figure: Figure) -> None:
 @drawn(9.0, 1.75)
 def motion_figure(figure: Figure) -> None:
     """Draw the sensor's path over a picture for several values of the motion parameters."""
-    picture = read_rgb(_photo()).permute(1, 2, 0).numpy()
+    picture = read_rgb(PHOTO).permute(1, 2, 0).numpy()
     default = MOTIONS["default"]
-    slow = replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0)
-    fast = replace(default, speed_min_px_s=250.0, speed_max_px_s=300.0, acceleration_max_px_s2=4000.0)
     motions = {
-        "40 to 50 px/s": slow,
-        "250 to 300 px/s": fast,
+        "40 to 50 px/s": replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0),
+        "250 to 300 px/s": replace(default, speed_min_px_s=250.0, speed_max_px_s=300.0, acceleration_max_px_s2=4000.0),
         "rotation up to 40°": replace(default, rotation_max_deg=40.0),
         "zoom up to 2.5": replace(default, zoom_max=2.5),
     }
@@ -227,40 +225,15 @@ def _light(axes: Axes, t_ms: Float64[np.ndarray, " n"], title: str) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def _rows(axes: Axes, labels: Sequence[str]) -> None:
-    axes.set_yticks([row + 0.4 for row in range(len(labels))], list(labels))
-
-
 def _ticks(axes: Axes, events: Events, row: float | int, height: float = 0.8) -> None:
     for polarity, colour in ((1, ON), (-1, OFF)):
         t_ms = events.t[events.p == polarity].numpy() / 1000
         axes.vlines(t_ms, row, row + height, color=colour, linewidth=1.1)
 
 
-def _of_pixel(events: Events, pixel: int) -> Events:
-    mine = events.x == pixel
-    return Events(events.t[mine], events.x[mine], events.y[mine], events.p[mine], events.height, events.width)
-
-
-def _counts(events: Events) -> torch.Tensor:
-    pixel = events.y.long() * events.width + events.x.long()
-    counts = torch.zeros(events.height * events.width).index_add_(0, pixel, events.p.float())
-    return counts.view(events.height, events.width)
-
-
-def _with(config: EmulatorConfig, name: str, value: float) -> EmulatorConfig:
-    names = [f"{name}_on", f"{name}_off"] if name == "contrast_threshold" else [name]
-    changed: dict[str, Any] = dict.fromkeys(names, value)
-    return replace(config, **changed)
-
-
-def _photo() -> Path:
-    return next(photo.path for photo in BUILTIN_PHOTOS if photo.file == PHOTO)
-
-
 def photograph() -> PolarizationScene:
     """The scene of the pictures: a built-in photograph."""
-    return scene_from_rgb(read_rgb(_photo()))
+    return scene_from_rgb(read_rgb(PHOTO))
 
 
 def few_colours(content: bytes, colours: int = COLOURS) -> bytes:

@@ -1,11 +1,9 @@
 """Speed and memory of the readers of recordings: python -m studies.speed_of_readers [--write] [--formats NAME ...]
 
-For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor to a temporary
-folder. polarnet reads it in chunks; every installed library (faery; `pip install eventcv expelliarmus`) reads it whole
-or in packets, as its interface does. Every reader runs in its own process with compiled kernels. Times are the shortest
-of five runs, from opening to the last chunk, with the file in the disk cache. Memory is the peak of the process and its
-children, minus that after reading a small file (Linux: high-water marks of resident memory). The speed is that of the
-smaller size.
+For each format and size, the study writes a file of random events, 1 M a second, of a 1280 x 720 sensor. polarnet reads
+it in chunks; every installed library (faery; `pip install eventcv expelliarmus`) whole or in packets, as its interface
+does, each in its own process. Times are the shortest of five runs with the file in the disk cache, of the smaller size.
+Memory is the peak of the process and its children, minus that after reading a small file (Linux).
 """
 
 import argparse

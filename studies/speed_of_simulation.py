@@ -1,16 +1,12 @@
 """Speed and accuracy of the emulator: python -m studies.speed_of_simulation [--write] [--paper-set N]
 
-The clip is scikit-image's coffee photograph mapped to polarization, a sensor of 120 x 180 pixels that drifts over it at
-110 px/s, 300 steps a second, four channels, one second. Times run from rendering to columns in memory and are medians
-of wall-clock time with compiled kernels. Every model and number of threads runs in its own process, and the processes
-take turns over several rounds, so that other load on the machine affects all of them alike.
+A sensor of 120 x 180 pixels drifts over the coffee photograph at 110 px/s for a second: 300 steps, four channels. Times
+run from rendering to columns in memory and are medians of wall-clock time with compiled kernels. Every model and number
+of threads runs in its own process; the processes take turns, so that other load affects all of them alike. Timing
+errors are those of noiseless pixels relative to `exact` at 4800 steps a second, where all polarities agree.
 
-Timing errors are those of noiseless pixels with equal thresholds, relative to `exact` at 4800 steps a second. They
-cover the pixels whose polarities agree from the first event to the last.
-
-The paper's set is made by the stages ingest, synthesize and emulate with experiment=paper on two workers, from the
-built-in photographs and dead leaves. `--paper-set N` makes about N sequences instead of 1000; minutes are never scaled.
-`--write` puts the figures into docs/results/emulation.json.
+The paper's set is made by ingest, synthesize and emulate with experiment=paper on two workers; `--paper-set N` makes
+about N sequences instead of 1000. `--write` puts the figures into docs/results/emulation.json.
 """
 
 import argparse
@@ -36,19 +32,11 @@ from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.storage.events import EventStore
 from studies.simulated_rig import Drift
+from studies.simulation_pictures import QUIET
 from studies.study import arguments_of, command_line, in_own_process, machine_record, run_stage, write_section
 
 HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
 DEFAULT = replace(SENSORS["default"], model="v2e")  # v2e's command-line defaults
-NOISELESS = replace(
-    DEFAULT,
-    contrast_threshold_sigma_on=0.0,
-    contrast_threshold_sigma_off=0.0,
-    cutoff_hz=0.0,
-    leak_rate_hz=0.0,
-    shot_noise_rate_hz=0.0,
-    refractory_period_us=0.0,
-)
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
 ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
@@ -100,7 +88,7 @@ def timing_errors_ms() -> dict[str, float]:
     scene, path = clip()
 
     def events_of(model: str, rate_hz: float) -> list[Events]:
-        config = replace(NOISELESS, model=model, render_rate_hz=rate_hz)
+        config = replace(QUIET, model=model, render_rate_hz=rate_hz)
         return list(emulate_motion(Camera(config, key=1), scene, path, DURATION_US, (HEIGHT, WIDTH)))
 
     reference = events_of("exact", REFERENCE_HZ)

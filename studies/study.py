@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from polarnet.reports.provenance import git, processor
+from polarnet.reports.artefacts import git, processor
 from polarnet.runtime.machine import bf16_units, usable_cores
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -90,10 +90,9 @@ def write_section(
     headlines: Mapping[str, Any] | None = None,
     root: Path = ROOT,
 ) -> Path:
-    """Write `figures` and the machine's record as one section of docs/results/NAME.json; other sections stay.
+    """Write `figures` and the record taken before measuring as a section of docs/results/NAME.json; others stay.
 
-    The record (`machine_record`, taken before measuring) becomes `records.SECTION`, because sections may be measured
-    on different days. `headlines` are figures above the sections; a mapping is merged into the existing one.
+    `headlines` are figures above the sections; a mapping is merged into the existing one.
     """
     path, known = root / "docs" / "results" / f"{name}.json", read_results(root, name)
     known["records"] = dict(sorted({**known.get("records", {}), section: dict(record)}.items()))

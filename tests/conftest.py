@@ -20,7 +20,6 @@ SLOWEST_FIRST = (
     "cli/test_simulate.py",
     "config/test_config.py",
     "reference/test_golden.py",
-    "cli/test_demo.py",
     "training/test_loop.py",
     "networks/test_onnx_export.py",
     "characterization/test_fit.py",

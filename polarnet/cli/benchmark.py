@@ -1,7 +1,6 @@
 """`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
 
-Pictures, scenes and events of a user's folder stay in `work` of the output, so that a stopped run resumes and a second
-run only runs the methods.
+Scenes and events of a user's folder stay in `work` of the output: a second run only runs the methods.
 """
 
 import argparse
@@ -70,27 +69,19 @@ def run(options: argparse.Namespace) -> None:
         config = load(settings, [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         if root is None:
-            _study(options, config)
+            with run_folder(options.out, "benchmark --event-budget") as study:
+                methods = options.methods.split(",") if options.methods else STUDIED
+                run_event_budget(config, study, methods, options.limit, options.weights)
+            files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
+            print(f"wrote to {options.out}: {', '.join(files)}")
             return
         notes = _score_folder(options, config, root, cleaning)
     print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")
 
 
-def _study(options: argparse.Namespace, config: Config) -> None:
-    methods = options.methods.split(",") if options.methods else STUDIED
-    with run_folder(options.out, "benchmark --event-budget") as folder:
-        run_event_budget(config, folder, methods, options.limit, options.weights)
-    files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
-    print(f"wrote to {options.out}: {', '.join(files)}")
-
-
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
-    """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out.
-
-    Size, duration and sensor of simulated scenes are printed first, with a warning if a network was trained with
-    others. ValueError if the folder has no usable file, or if the weights of a network or of LPIPS are missing.
-    """
+    """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     if options.weights is not None and not options.weights.is_file():
         raise ValueError(
             f"--weights {options.weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
@@ -99,7 +90,9 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
     lpips = None if weights is None else Lpips.of(weights.backbone, weights.tensors)
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
-    context = context_of(config, wanted, _train_mean(config), options.weights or shipped_weights())
+    frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
+    mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
+    context = context_of(config, wanted, mean, options.weights or shipped_weights())
     methods, left_out = available(wanted, context)
     if options.recordings:
         left_out |= {row: NOT_ROTATING for row in methods if is_rotating(row)}
@@ -114,7 +107,10 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             conditions = {"sentence": RECORDED_SENTENCE, "recorded": True, "warnings": []}
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
         notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
-        rotating = _rotating_events(config, work) if any(map(is_rotating, methods)) else None
+        rotating = None
+        if any(map(is_rotating, methods)):
+            rotating, mapper = work.with_name("rotating.zarr"), config.mapper("emulate_rotating")
+            emulate_rotating_scenes(work / "scenes.zarr", rotating, config.rotating, config.camera, config.seed, mapper)
         test_set = made_set(root.name, work, rotating)
         mapper = config.mapper("benchmark")
 
@@ -147,16 +143,3 @@ def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: 
     unused = dataclasses.replace(manifest, pictures=tuple(e for e in manifest.pictures if e.name not in simulated))
     _, small = motions_of(unused, config.synthesize, config.seed)
     return [f"{skipped.file} was skipped: {skipped.reason}" for skipped in (*manifest.skipped, *small)]
-
-
-def _rotating_events(config: Config, work: Path) -> Path:
-    """Emulate the scenes behind a rotating polarizer; returns the path of the events."""
-    events, mapper = work.with_name("rotating.zarr"), config.mapper("emulate_rotating")
-    emulate_rotating_scenes(work / "scenes.zarr", events, config.rotating, config.camera, config.seed, mapper)
-    return events
-
-
-def _train_mean(config: Config) -> float | None:
-    """Mean DoLP of the pipeline's training split; None if the pipeline has not made the split."""
-    frames = Path(config.paths.frames)
-    return train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None

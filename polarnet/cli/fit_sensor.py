@@ -11,7 +11,7 @@ from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.events.stream import Events
 from polarnet.recordings.recording import read_recording
-from polarnet.reports.realism import FitRow, realism_page
+from polarnet.reports.realism import realism_page
 from polarnet.simulation.presets import SENSORS
 
 WRITTEN_BY = "# Written by `polarnet fit-sensor`"
@@ -64,8 +64,8 @@ def run(options: argparse.Namespace) -> None:
             f"up to 2.4; give --static-light"
         )
     rows = _rows(fit)
-    for row in [FitRow("parameter", "estimate", "std. error", "from"), *rows]:
-        print(f"{row.parameter:32}{row.estimate:24}{row.error:12}{row.source}".rstrip())
+    for parameter, estimate, error, source in [("parameter", "estimate", "std. error", "from"), *rows]:
+        print(f"{parameter:32}{estimate:24}{error:12}{source}".rstrip())
     for note in notes:
         print(f"note: {note}")
     preset.parent.mkdir(parents=True, exist_ok=True)
@@ -100,13 +100,13 @@ def check_options(options: argparse.Namespace) -> None:
         raise ValueError("--contrast: expected the contrast of the flicker, 0 to 1, together with --flicker FILE")
 
 
-def _rows(fit: SensorFit) -> list[FitRow]:
+def _rows(fit: SensorFit) -> list[tuple[str, str, str, str]]:
     rows = []
     for name, unit in UNITS.items():
         if one := fit.estimates.get(name):
-            rows.append(FitRow(name, f"{one.value:.4g} {unit}".rstrip(), f"{one.error:.2g}", one.source))
+            rows.append((name, f"{one.value:.4g} {unit}".rstrip(), f"{one.error:.2g}", one.source))
         else:
-            rows.append(FitRow(name, "not estimated", "", f"{fit.missing[name]}; the default stays"))
+            rows.append((name, "not estimated", "", f"{fit.missing[name]}; the default stays"))
     return rows
 
 

@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,7 +56,9 @@ def simulate(options: argparse.Namespace) -> None:
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
     clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, size))
-    refuse_unused_options(options, clip, len(inputs))
+    unused = ["times", "fps", "size", "upsample"] if clip.still else []
+    unused += ["grey" if clip.measured else "white", "mosaic" if len(inputs) == 4 else "angles"]
+    refuse(options, "a single frame" if clip.still else clip.words, unused)
     times = None if clip.still else _times_of(options, clip, inputs[0])
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
@@ -81,19 +83,13 @@ def simulate(options: argparse.Namespace) -> None:
 
 
 class Times(NamedTuple):
-    """Times of a clip's frames: `t_us`, or multiples of 1 / `rate_hz`; if both are None, those of the video itself."""
+    """Times of a clip's frames."""
 
     source: str
-    t_us: list[int] | None = None
-    rate_hz: float | None = None
-
-    def of(self, number: int, frame: ClipFrame, first: ClipFrame) -> int:
-        """Time of a frame in microseconds; `first` is the clip's first frame."""
-        if self.t_us is not None:
-            return self.t_us[number]
-        if self.rate_hz is not None:
-            return round(number * 1e6 / self.rate_hz)
-        return round((frame.t_us or 0.0) - (first.t_us or 0.0))
+    of: Callable[[int, ClipFrame], float]
+    """Time in microseconds of a frame, by its number; it may start at any time."""
+    count: int | None = None
+    """Number of times; None: as many as frames."""
 
 
 def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str], formats: list[str]) -> None:
@@ -111,28 +107,21 @@ def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str]
         raise ValueError("--times, --fps: expected one of them, got both; leave one out")
 
 
-def refuse_unused_options(options: argparse.Namespace, clip: Clip, inputs: int) -> None:
-    """ValueError for an option that does not apply to the given kind of input."""
-    unused = ["times", "fps", "size", "upsample"] if clip.still else []
-    unused += ["grey" if clip.measured else "white", "mosaic" if inputs == 4 else "angles"]
-    refuse(options, "a single frame" if clip.still else clip.words, unused)
-
-
 def _times_of(options: argparse.Namespace, clip: Clip, path: Path) -> Times:
     if options.fps:
-        return Times("--fps", rate_hz=options.fps)
+        return Times("--fps", lambda number, frame: number * 1e6 / options.fps)
     stated = path / TIMES_FILE
     file = options.times or (stated if stated.is_file() else None)
     if file is None and path.is_dir():
         raise ValueError(f"{path.name}: expected the times of the frames; give --fps HZ, --times FILE, or {stated}")
     if file is None:
-        return Times(path.name)
+        return Times(path.name, lambda number, frame: frame.t_us or 0.0)
     t_us = check_times(times_from_file(file, options.time_unit), file.name)
     if clip.count is not None and len(t_us) != clip.count:
         raise ValueError(
             f"{file.name}: expected a time for each of {clip.count} frames, got {len(t_us)}; write one line a frame"
         )
-    return Times(file.name, t_us=t_us.tolist())
+    return Times(file.name, lambda number, frame: int(t_us[number]), len(t_us))
 
 
 def _run(config: Config, clip: Clip, times: Times | None, output: Output) -> dict[str, str]:
@@ -177,12 +166,13 @@ def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[
 
     ValueError for more or fewer times than frames, and for times of a video that do not increase.
     """
-    number, before, first = -1, -1, None
+    number, before, first = -1, -1, 0.0
     for number, frame in enumerate(clip.frames()):
-        if times.t_us is not None and number == len(times.t_us):
+        if number == times.count:
             raise ValueError(f"{times.source}: expected a time for each frame, got {number} times and more frames")
-        first = first or frame
-        t_us = times.of(number, frame, first)
+        time_us = times.of(number, frame)
+        first = time_us if number == 0 else first
+        t_us = round(time_us - first)
         if t_us <= before:
             raise ValueError(
                 f"{times.source}: expected times that increase, got {before} and {t_us} us for frames {number - 1} and "
@@ -191,5 +181,5 @@ def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[
         before = t_us
         saturation.append(frame.saturated)
         yield StokesFrame(t_us, _polarized(clip, frame).stokes)
-    if times.t_us is not None and number + 1 < len(times.t_us):
-        raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {len(times.t_us)}")
+    if times.count is not None and number + 1 < times.count:
+        raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {times.count}")

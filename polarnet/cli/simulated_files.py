@@ -60,13 +60,13 @@ class EventSpool:
 
     def channels(self) -> list[Events]:
         """All events so far; their columns stay on disk until they are used."""
-        columns = [{name: self._column(k, name) for name in COLUMNS} for k in range(len(self._sizes))]
-        return [Events(**one, height=h, width=w) for one, (h, w) in zip(columns, self._sizes, strict=True)]
 
-    def _column(self, channel: int, name: str) -> Tensor:
-        file, dtype = self.folder / f"{channel}.{name}", COLUMNS[name]
-        values = np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype)  # no map is empty
-        return torch.from_numpy(values)
+        def column(channel: int, name: str) -> Tensor:
+            file, dtype = self.folder / f"{channel}.{name}", COLUMNS[name]
+            values = np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype)  # no map is empty
+            return torch.from_numpy(values)
+
+        return [Events(*(column(k, name) for name in COLUMNS), *size) for k, size in enumerate(self._sizes)]
 
 
 def write_simulation(

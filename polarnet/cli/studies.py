@@ -41,11 +41,7 @@ STUDIED = ("oracle_mean", "cf", "highpass", "ours")
 def run_event_budget(
     config: Config, out: Path, methods: Sequence[str], limit: int | None, weights: Path | None
 ) -> dict[str, Any]:
-    """Write event_budget.json, event_budget.png and the paper's Fig. 11 (.png, .pdf) of one sequence a set to `out`.
-
-    Fig. 11 is drawn of the simulated set and, if they are enabled, of the real targets. ValueError if `ours` has no
-    weights.
-    """
+    """Write event_budget.json and .png and the paper's Fig. 11 of a sequence a set; ValueError without weights."""
     unknown = [method for method in methods if method not in ROWS]
     if unknown or not methods:
         raise ValueError(f"--methods: expected some of {', '.join(ROWS)}, got {', '.join(unknown) or 'none'}")

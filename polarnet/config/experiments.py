@@ -70,7 +70,9 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml.width = 120
     yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
-    params, base = yaml.load(path), _flat(_original(root))
+    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
+    original = shipped_settings() / "params.yaml" if committed.returncode else committed.stdout
+    params, base = yaml.load(path), _flat(YAML(typ="safe").load(original))
     undone = GROUPS if group == "experiment" else (group,)
     others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
     values = {key: base.get(key) for other in others for key in other} | preset_values(root, group, name)
@@ -86,13 +88,6 @@ def write_preset(root: Path, name: str) -> list[str]:
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
-
-
-def _original(root: Path) -> Any:
-    """params.yaml as last committed, or as it came with polarnet."""
-    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
-    shipped = shipped_settings() / "params.yaml"
-    return YAML(typ="safe").load(shipped if committed.returncode else committed.stdout)
 
 
 def _in_style(value: Any) -> Any:
@@ -117,11 +112,7 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def check_overrides(settings: type, root: Path, overrides: list[str], presets: Path | None = None) -> None:
-    """Raise ValueError for an override of a key that `settings` lacks, or of a group that has no such choice.
-
-    The groups are `experiment`, `sensor`, `polarizers` and `ablation`. Hydra refuses both as well, but this message
-    lists the available keys and choices.
-    """
+    """ValueError, with those there are, for an override of an unknown key or for an unknown choice of a group."""
     _check_params(settings, root / "params.yaml")
     groups = {path.name for path in (root / "conf").iterdir() if path.is_dir()}
     for override in overrides:

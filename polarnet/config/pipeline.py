@@ -10,7 +10,7 @@ from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
 from polarnet.config.tree import Config, or_exit
-from polarnet.events.rotation import Rotation, steady_rotation
+from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
 from polarnet.metrics.references import REFERENCES
@@ -37,6 +37,11 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
     """
     if weights is None and method.networks:
         weights = config.weights_of(method.name) or config.weights_of(method.section)
+    rotation = None
+    if method.rotating:  # as the pipeline's events were made; without them, as section `rotating` says
+        events = Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr"
+        made = EventStore.open(events).attributes["rotating"] if events.exists() else vars(config.rotating)
+        rotation = steady_rotation(made["rate_hz"], math.radians(made["start_angle_deg"]))
     return Setup(
         config=getattr(config.methods, method.section, None),
         weights=weights,
@@ -44,15 +49,8 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         gain=config.methods.gain,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
-        rotation=_rotation_of(config) if method.rotating else None,
+        rotation=rotation,
     )
-
-
-def _rotation_of(config: Config) -> Rotation:
-    """That of the pipeline's events behind a rotating polarizer; without them, that of section `rotating`."""
-    events = Path(config.paths.rotating) / f"{config.benchmark.sets[0]}.zarr"
-    made = EventStore.open(events).attributes["rotating"] if events.exists() else dataclasses.asdict(config.rotating)
-    return steady_rotation(made["rate_hz"], math.radians(made["start_angle_deg"]))
 
 
 def pipeline_set(config: Config, name: str, rows: Sequence[str] = ()) -> BenchmarkSet:

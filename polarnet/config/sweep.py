@@ -17,8 +17,9 @@ FAILURE = "failure.txt"
 """File in the folder of a failed job with the reason in one line."""
 FINISHED = "finished.json"
 """File in the folder of a finished job with all of its values, and hashes of its inputs."""
-SCORES = {"validation": ("mse", "psnr"), "test": ("mse", "psnr", "ssim", "lpips", "corr")}
-"""Scores of a point by split; test scores rank nothing."""
+SCORES = [("validation", name) for name in ("mse", "psnr")]
+SCORES += [("test", name) for name in ("mse", "psnr", "ssim", "lpips", "corr")]
+"""Split and name of each score of a point; test scores rank nothing."""
 
 
 class SweepTable(Callback):
@@ -36,7 +37,11 @@ class SweepTable(Callback):
         rows = sweep_rows(points)
         write_csv(rows, folder / "comparison.csv")
         if axes := swept_axes(rows):
-            (folder / "comparison.png").write_bytes(_plot(*axes))
+            # every stage imports this module, and only a sweep draws
+            from polarnet.reports.charts import parallel_coordinates
+            from polarnet.reports.maps import png
+
+            (folder / "comparison.png").write_bytes(png(parallel_coordinates(*axes, "validation MSE")))
         print(f"\n{ranking(rows)}\n{best_point(rows)}\nAll scores: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
@@ -82,34 +87,24 @@ def _point(folder: Path, job: Path) -> dict[str, Any]:
 def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Merge points that differ only in the seed into one row, and sort the rows by validation MSE.
 
-    The smallest MSE comes first, and rows without MSE come last. Each score becomes `mean` and `std`, the standard
-    deviation over seeds (None for one seed).
+    The smallest MSE comes first, and rows without MSE come last. A row has SPLIT_SCORE, the mean over seeds, and
+    SPLIT_SCORE_std, the standard deviation (None for one seed), of each score that all of its trainings have.
     """
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for point in points:
         groups.setdefault(tuple(one for one in point["overrides"] if not one.startswith("seed=")), []).append(point)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for overrides, group in groups.items():
-        finished = [point for point in group if not point["failure"]]
-        rows.append({
-            "jobs": [point["job"] for point in group],
-            "overrides": list(overrides),
-            "seeds": [point["seed"] for point in finished],
-            "failed_seeds": [point["seed"] for point in group if point["failure"]],
-            **{split: _mean_scores([point[split] for point in finished], names) for split, names in SCORES.items()},
-            "notes": [f"seed {point['seed']} failed: {point['failure']}" for point in group if point["failure"]],
-        })  # fmt: skip
-    return sorted(rows, key=lambda row: row["validation"]["mse"]["mean"] if row["validation"] else float("inf"))
-
-
-def _mean_scores(scores: Sequence[Mapping[str, float | None]], names: Sequence[str]) -> dict[str, Any]:
-    """Mean and standard deviation over trainings of the scores `names`; a score missing from a training is omitted."""
-    means = {}
-    for name in names:
-        values = [value for one in scores if (value := one.get(name)) is not None]
-        if values and len(values) == len(scores):
-            means[name] = {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None}
-    return means
+        finished, failed = ([point for point in group if bool(point["failure"]) == bad] for bad in (False, True))
+        row = {"jobs": [point["job"] for point in group], "overrides": list(overrides)}
+        row |= {"seeds": [one["seed"] for one in finished], "failed_seeds": [one["seed"] for one in failed]}
+        for split, name in SCORES:
+            values = [point[split].get(name) for point in finished]
+            known = bool(values) and None not in values
+            row[f"{split}_{name}"] = fmean(values) if known else None
+            row[f"{split}_{name}_std"] = stdev(values) if known and len(values) > 1 else None
+        rows.append(row | {"notes": [f"seed {one['seed']} failed: {one['failure']}" for one in failed]})
+    return sorted(rows, key=lambda row: float("inf") if row["validation_mse"] is None else row["validation_mse"])
 
 
 def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -117,16 +112,16 @@ def best_point(rows: Sequence[Mapping[str, Any]]) -> str:
     from scipy.stats import t  # slow to import
 
     best = rows[0]
-    if not best["validation"]:
+    mean, std, count = best["validation_mse"], best["validation_mse_std"], len(best["seeds"])
+    if mean is None:
         return "No point finished."
-    mse, count = best["validation"]["mse"], len(best["seeds"])
     shared = shared_overrides(rows)
     own = " ".join(one for one in best["overrides"] if one not in shared)
-    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mse['mean']:.4f}"
-    if mse["std"] is None:
+    words = f"Best: {own or 'the settings of params.yaml'}, validation MSE {mean:.4f}"
+    if std is None:
         return f"{words}, of one seed; sweep over seed=1,2,3 for an interval."
-    half = float(t.ppf(0.975, count - 1)) * mse["std"] / count**0.5
-    return f"{words}, 95 % interval over {count} seeds {mse['mean'] - half:.4f} to {mse['mean'] + half:.4f}."
+    half = float(t.ppf(0.975, count - 1)) * std / count**0.5
+    return f"{words}, 95 % interval over {count} seeds {mean - half:.4f} to {mean + half:.4f}."
 
 
 def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -137,23 +132,11 @@ def shared_overrides(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def swept_axes(rows: Sequence[Mapping[str, Any]]) -> tuple[dict[str, list[str]], list[float]] | None:
     """Values of the keys that differ between finished rows, and their validation MSE; None if no key differs."""
-    done = [row for row in rows if row["validation"]]
+    done = [row for row in rows if row["validation_mse"] is not None]
     given = [dict(one.lstrip("+").split("=", 1) for one in row["overrides"]) for row in done]
-    keys = [
-        key for key in dict.fromkeys(key for one in given for key in one) if len({one.get(key) for one in given}) > 1
-    ]
-    if not keys:
-        return None
-    return {key: [one.get(key, "-") for one in given] for key in keys}, [
-        row["validation"]["mse"]["mean"] for row in done
-    ]
-
-
-def _plot(values: Mapping[str, Sequence[str]], scores: Sequence[float]) -> bytes:
-    from polarnet.reports.charts import parallel_coordinates  # every stage imports this module, and only a sweep draws
-    from polarnet.reports.maps import png
-
-    return png(parallel_coordinates(values, scores, "validation MSE"))
+    values = {key: [one.get(key, "-") for one in given] for key in dict.fromkeys(key for one in given for key in one)}
+    differing = {key: column for key, column in values.items() if len(set(column)) > 1}
+    return (differing, [row["validation_mse"] for row in done]) if differing else None
 
 
 def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -162,7 +145,7 @@ def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = [f"{'validation MSE':>19}  {'test MSE':>19}  seeds   overrides"]
     for row in rows:
         finished, failed = len(row["seeds"]), len(row["failed_seeds"])
-        validation, test = (_printed(row[split].get("mse")) for split in SCORES)
+        validation, test = (_printed(row[f"{split}_mse"], row[f"{split}_mse_std"]) for split in ("validation", "test"))
         seeds = f"{finished} of {finished + failed}" if failed else f"{finished}"
         own = " ".join(one for one in row["overrides"] if one not in shared)
         lines.append(f"{validation:>19}  {test:>19}  {seeds:<6}  {own}".rstrip())
@@ -170,24 +153,18 @@ def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join([*lines, *([f"All have {' '.join(shared)}."] if shared else [])])
 
 
-def _printed(score: Mapping[str, float | None] | None) -> str:
-    if score is None:
-        return "-"
-    return f"{score['mean']:.4f}" + (f" ± {score['std']:.4f}" if score["std"] is not None else "")
+def _printed(mean: float | None, std: float | None) -> str:
+    return "-" if mean is None else f"{mean:.4f}" + ("" if std is None else f" ± {std:.4f}")
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write `sweep_rows` as one line each, with columns SPLIT_SCORE and SPLIT_SCORE_std."""
-    names = [f"{split}_{name}{end}" for split in SCORES for name in SCORES[split] for end in ("", "_std")]
-    given = ("jobs", "overrides", "seeds", "failed_seeds")
+    """Write `sweep_rows` as one line each."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*given, *names, "notes"])
+        writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         for row in rows:
-            line = {key: " ".join(map(str, row[key])) for key in given} | {"notes": "; ".join(row["notes"])}
-            scores = {f"{split}_{name}": score for split in SCORES for name, score in row[split].items()}
-            line |= {name: score["mean"] for name, score in scores.items()}
-            writer.writerow(line | {f"{name}_std": score["std"] for name, score in scores.items()})
+            lists = {key: " ".join(map(str, value)) for key, value in row.items() if isinstance(value, list)}
+            writer.writerow({**row, **lists, "notes": "; ".join(row["notes"])})
 
 
 def _read(path: Path) -> Any:

@@ -14,10 +14,9 @@ from polarnet.training.engine.recorder import HISTORY
 
 
 def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
-    """Put the table of each set together from the folders of `benchmark.methods`; returns scores and costs by row.
+    """Write each set's table and metrics.json from the folders of `benchmark.methods`; returns scores by set and row.
 
-    metrics.json in the benchmark's folder holds the scores of all sets, for `dvc metrics`. FileNotFoundError names a
-    row that was not run; ValueError if every row was left out.
+    FileNotFoundError names a row that was not run; ValueError if every row was left out.
     """
     records = {row: read_record(row_folder(config, row)) for row in config.benchmark.methods}
     left_out = {row: record.left_out for row, record in records.items() if record.left_out is not None}

@@ -40,7 +40,6 @@ from polarnet.training.engine.loop import LoopConfig, TrainConfig
 from polarnet.training.engine.losses import LossConfig
 
 ROOT_VARIABLE = "POLARNET_ROOT"  # read by hydra.searchpath in conf/config.yaml
-EXPERIMENT_COPY = "/.dvc/tmp/exps/"  # subfolder of the project in which DVC runs queued experiments
 BEST = "best.safetensors"
 DOLP_TRAINING = "ours"
 """Training of the DoLP network, in data/train beside the baselines."""
@@ -280,9 +279,8 @@ def typed(node: DictConfig) -> Config:
 
 
 def load(root: Path, overrides: list[str] | None = None, presets: Path | None = None) -> Config:
-    """Load the configuration of the project at `root`, outside any Hydra application.
+    """Load the configuration of the project at `root`; overrides may also choose presets from conf/ of `presets`.
 
-    Overrides may also choose presets from conf/ of the folder `presets`, which need not be a project. Raises
     ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
     """
     overrides = overrides or []
@@ -299,9 +297,7 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
 def hydra_stage(main: Stage) -> Callable[[], None]:
     """Make `main(config)` a Hydra command line that checks the configuration and sets up the runtime first.
 
-    The command refuses an unknown key or choice, a wrong type, a value out of range and an ablation that changes
-    nothing. It also refuses a configuration with LPIPS on a machine without the weights, and inputs that were made with
-    other values (`polarnet.config.origins`).
+    It also refuses LPIPS without its weights, and inputs made with other values (`polarnet.config.origins`).
     """
     root, script = _root_of(main), _file_of(main).stem
 
@@ -348,21 +344,14 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
 
 
 def input_folder(key: str, folder: str) -> Path:
-    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files.
-
-    A queued DVC experiment runs in a copy of the workspace; there the message says how to bring in the files.
-    """
+    """Folder that setting `key` names; SystemExit with a one-line message if it holds no user files."""
     files = (path for path in Path(folder).rglob("*") if (path.is_file() or path.is_symlink()) and path.name[0] != ".")
     if any(path.name != "README.md" and path.suffix != ".dvc" for path in files):
         return Path(folder)
-    project, copy, _ = str(Path.cwd()).partition(EXPERIMENT_COPY)
-    advice = f"put your files there, or set {key} to another folder"
-    if copy:
-        advice = (
-            "a queued DVC experiment runs in a copy of the workspace without untracked files; queue it with "
-            f"-S {key}={Path(project) / folder}, or `dvc add` your files in a folder below {folder} first"
-        )
-    raise SystemExit(f"{key}={folder}: no files there; {advice}")
+    raise SystemExit(
+        f"{key}={folder}: no files there; put your files there, or set {key} to another folder (for a queued "
+        f"experiment, to its absolute path)"
+    )
 
 
 def _root_of(main: Callable[..., None]) -> Path:
@@ -377,8 +366,7 @@ def _file_of(main: Callable[..., None]) -> Path:
 def with_lpips(config: Config, purpose: Purpose, use: Callable[[str], T]) -> T | None:
     """Call `use` with the LPIPS backbone for a purpose; None if the purpose needs no LPIPS.
 
-    The message of a ValueError from `use` is preceded by the keys that request LPIPS and followed by the overrides
-    that turn it off.
+    A ValueError from `use` gets the keys that request LPIPS and the overrides that turn it off.
     """
     if purpose == "loss":
         backbone, off = config.lpips.backbone, "0"
@@ -419,14 +407,11 @@ def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
     if _in_use(config) != _in_use(without):
         return
     experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
-    reasons = []
-    for key in preset_values(root, "ablation", name):
-        if key.startswith("networks.") and key.split(".")[1] != config.network:
-            reasons.append(f"{key} has no effect on network={config.network}")
-        else:
-            value = functools.reduce(getattr, key.split("."), config)
-            reasons.append(f"{key} is {value} already in {experiment}")
-    raise ValueError(f"ablation={name} changes nothing: {', '.join(reasons)}")
+    values = ", ".join(f"{key}={value}" for key, value in preset_values(root, "ablation", name).items())
+    raise ValueError(
+        f"ablation={name} changes nothing: {values} stands already in {experiment}, or is of another network than "
+        f"{config.network}; choose another ablation"
+    )
 
 
 def _in_use(config: Config) -> tuple[Any, ...]:

@@ -205,7 +205,7 @@ def _opened(address: str) -> Any:
     try:
         import dv_processing
     except ImportError:
-        raise RuntimeError(f"{address} needs dv-processing: {installation('live')}") from None
+        raise RuntimeError(f"{address} needs dv-processing: {installation('recordings')}") from None
     place = address.removeprefix(SCHEME)
     network = NETWORK.fullmatch(place)
     if network is None and place != CAMERA:

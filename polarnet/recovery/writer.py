@@ -32,8 +32,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
-from polarnet.reports.preview import Sheet, foot_of
-from polarnet.reports.videos import VideoWriter, with_even_sides
+from polarnet.reports.preview import Sheet, VideoWriter, foot_of, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK

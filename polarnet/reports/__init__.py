@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
+    from polarnet.reports.preview import VideoWriter as VideoWriter
     from polarnet.reports.preview import plot_events as plot_events
     from polarnet.reports.preview import plot_frame as plot_frame
     from polarnet.reports.preview import plot_prediction as plot_prediction
     from polarnet.reports.preview import write_true_video as write_true_video
-    from polarnet.reports.videos import VideoWriter as VideoWriter
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -1,6 +1,9 @@
-"""Read the pipeline's outputs for the report."""
+"""The pipeline's outputs as the report reads them, and the code, machine and versions behind them."""
 
+import importlib.metadata
 import json
+import platform
+import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +11,7 @@ from typing import Any, NamedTuple
 
 from polarnet.reports.legend import legend_of
 from polarnet.reports.tables import Table, score_table
+from polarnet.runtime.machine import usable_cores
 from polarnet.storage.panels import Panel, read_panel
 from polarnet.training.engine.recorder import best_row, read_history
 
@@ -78,3 +82,48 @@ def training_history(folder: Path) -> History:
 
 def _json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "opencv-contrib-python-headless", "dvc", "hydra-core")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Provenance of a run's results, as shown on the page."""
+
+    command: str
+    """Command that reproduces the results."""
+    parameters: Mapping[str, Any]
+    """The params.yaml in use: sections and single values."""
+    facts: Mapping[str, str]
+    """Seed, commit, machine, versions."""
+
+
+def facts(root: Path) -> dict[str, str]:
+    """Commit of the project at `root`, if any, and machine and versions of this process."""
+    commit = git(root, "rev-parse", "HEAD") or "none: not a git repository with a commit"
+    # the pipeline's own outputs do not count as changes of the code
+    changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+    return {
+        "commit": f"{commit}, with uncommitted changes" if changed else commit,
+        "machine": f"{processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
+        "versions": f"Python {platform.python_version()}, {versions}",
+    }
+
+
+def git(root: Path, *arguments: str) -> str:
+    """Output of a git command; empty if it fails."""
+    try:
+        done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True)
+    except FileNotFoundError:  # git is not installed
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def processor() -> str:
+    """The processor's name, as reported by the system."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -124,7 +124,9 @@ def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], leg
 def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Figure:
     """Heat map: MSE of each method on each test set, divided by the best constant's; no tile without both."""
     methods = with_structure(dict.fromkeys(method for one in sets for method in one.metrics))
-    ratios = np.array([[_to_constant(one, method) for one in sets] for method in methods])
+    errors = [[one.metrics.get(row, {}).get("mse") for one in sets] for row in [*methods, "oracle_mean"]]
+    known = np.array(errors, float)  # not a number where an error is unknown
+    ratios = known[:-1] / known[-1]
     figure, axes = _method_axes([legend.label(method) for method in methods])
     logarithms = np.log(ratios)
     axes.imshow(logarithms, cmap="cividis_r", aspect="auto")
@@ -139,12 +141,6 @@ def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legen
     return figure
 
 
-def _to_constant(one: Results, method: str) -> float:
-    """MSE of a method on a set, divided by that of the best constant; not a number where either is unknown."""
-    mse, constant = (one.metrics.get(row, {}).get("mse") for row in (method, "oracle_mean"))
-    return mse / constant if mse and constant else float("nan")
-
-
 @styled(LIGHT)
 def event_budget_figure(results: Mapping[str, Any]) -> Figure:
     """PSNR (dB) and correlation of DoLP against events per pixel since the start, and against window length.
@@ -153,24 +149,20 @@ def event_budget_figure(results: Mapping[str, Any]) -> Figure:
     """
     figure = Figure(figsize=(7.0, 5.0), layout="constrained", facecolor="none")
     axes = figure.subplots(2, 2, sharey="row")
-    for row, (metric, label) in zip(axes, (("psnr", "PSNR, dB"), ("corr", "correlation")), strict=True):
-        for axis, study, x, scale in zip(
-            row, ("since_start", "window_length"), ("events_per_pixel", "window_us"), (1.0, 1e-3), strict=True
-        ):
+    for column, (study, x, scale, label, title) in zip(axes.T, (
+        ("since_start", "events_per_pixel", 1.0, "events per pixel", "since the start (dashed: the paper's 1.04)"),
+        ("window_length", "window_us", 1e-3, "window, ms", "by window length"),
+    ), strict=True):  # fmt: skip
+        for axis, metric in zip(column, ("psnr", "corr"), strict=True):
             for method in in_order(results[study]):
-                entries = results[study][method]
-                places = [scale * entry[x] for entry in entries]
-                colour, name = GENERAL.colour(method), GENERAL.label(method)
-                axis.plot(places, [entry[metric] for entry in entries], "o-", color=colour, label=name)
+                places, values = zip(*((scale * one[x], one[metric]) for one in results[study][method]), strict=True)
+                axis.plot(places, values, "o-", color=GENERAL.colour(method), label=GENERAL.label(method))
             _logarithmic(axis, "x")
-        row[0].axvline(PAPER_EVENTS_PER_PIXEL, color=LIGHT.quiet, linewidth=0.9, linestyle="--")
-        row[0].set_ylabel(label)
-    for axis, title, x in zip(
-        axes.T, ("since the start (dashed: the paper's 1.04)", "by window length"), ("events per pixel", "window, ms"),
-        strict=True,
-    ):  # fmt: skip
-        axis[0].set_title(title, loc="left", fontsize=9)
-        axis[1].set_xlabel(x)
+        column[0].set_title(title, loc="left", fontsize=9)
+        column[1].set_xlabel(label)
+    for axis, label in zip(axes[:, 0], ("PSNR, dB", "correlation"), strict=True):
+        axis.axvline(PAPER_EVENTS_PER_PIXEL, color=LIGHT.quiet, linewidth=0.9, linestyle="--")
+        axis.set_ylabel(label)
     axes[0][0].legend()
     return figure
 

@@ -24,6 +24,9 @@ class Network(NamedTuple):
 
 RECONSTRUCTS = "a recurrent network from events to intensity, one polarizer at a time, then DoLP by the Stokes formula."
 NETWORKS = {
+    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
+    for name in ("paper", "e2p", "cista_tc")
+} | {
     "polarnet": Network(
         "polarnet's network",
         METHODS["ours"].colour,
@@ -34,9 +37,6 @@ NETWORKS = {
     "firenet": Network(
         "FireNet", METHODS["firenet_published"].colour, f"FireNet (Scheerlinck et al. 2020), {RECONSTRUCTS}"
     ),
-} | {
-    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
-    for name in ("paper", "e2p", "cista_tc")
 }
 """Networks by their name in a checkpoint."""
 
@@ -110,17 +110,6 @@ def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -
         if row in weights or (row in ROWS and ROWS[row].about and (row not in METHODS or not METHODS[row].networks))
     ]
     return entries + ([("gains solved", GAINS)] if any(method.endswith(GAIN) for method in rows) else [])
-
-
-def lpips_about(lpips: Mapping[str, Any]) -> str | None:
-    """Explanation of LPIPS with the backbone named by details.json's `lpips`; None if the table has no such column."""
-    if lpips["backbone"] is None:
-        return None
-    backbone = LPIPS_BACKBONES.get(lpips["backbone"], lpips["backbone"])
-    return (
-        f"Learned perceptual distance, version 0.1, with {backbone} as its backbone, of DoLP as a grey picture. Values "
-        "of different backbones cannot be compared; the paper's backbone is VGG16."
-    )
 
 
 def _about(row: str, file: Mapping[str, Any] | None) -> str:

@@ -4,6 +4,7 @@ import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,9 @@ from ruamel.yaml import YAML
 
 from polarnet.methods import METHODS, is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
-from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, read_results, training_history
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, training_history
 from polarnet.reports.charts import reliability_chart, scatter_chart, score_chart, sets_chart, training_chart
 from polarnet.reports.figures import svg
-from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import (
     LABELS,
     NAMED_BY_NETWORK,
@@ -22,15 +22,13 @@ from polarnet.reports.legend import (
     glossary,
     in_order,
     legend_of,
-    lpips_about,
     network_label,
     with_structure,
 )
 from polarnet.reports.maps import png
 from polarnet.reports.paper import comparison_figure, write_paper_files
-from polarnet.reports.player import panel_film, player_data
-from polarnet.reports.provenance import Run
-from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, Table, paper_table, score_table
+from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
+from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, paper_table, score_table
 from polarnet.storage.scenes import SceneStore
 
 OURS = "ours"
@@ -112,6 +110,9 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         (folder / "comparison.png").write_bytes(png(figure))
     films = [panel_film(panel, legend) for panel in results.panels]
     films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
+    names = [film.name for film in films]
+    worst = sorted(means.get(method, {}).items(), key=lambda item: -item[1])[:WORST_SCENES]
+    set_table = partial(score_table, columns=PAGE_COLUMNS, labels=legend.labels)
     values = {
         "notes": [],
         "parameters": None,
@@ -119,16 +120,23 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "pictures": None,
         "details": details,
         "verdict": verdict(metrics, details, legend),
-        "scores": _page_table(results, legend),
+        "scores": set_table(metrics, warmup_windows=details["warmup_windows"]),
         "all_scores": score_table(metrics, labels=legend.labels),
         "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
         "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
-        "worst": _worst_scenes(means.get(method, {}), [film.name for film in films]),
+        "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
         "glossary": glossary(metrics, details["weights"]),
-        "lpips_about": lpips_about(details["lpips"]),
         "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
-        "sets": [_set(one, legend) for one in others],
+        "sets": [
+            {
+                "title": SET_TITLES.get(one.name, one.name),
+                "about": SET_ABOUT.get(one.name, ""),
+                "details": one.details,
+                "scores": set_table(one.metrics, warmup_windows=one.details["warmup_windows"]),
+            }
+            for one in others
+        ],
         "charts": _charts(sets, legend),
         "player_json": embedded_json(player_data(films)) if films else None,
         "script": script,
@@ -152,10 +160,6 @@ def _charts(sets: Sequence[Results], legend: Legend) -> dict[str, Any]:
         "reliability": svg(reliability_chart(curves, legend)) if curves else None,
         "sets": svg(sets_chart(sets, SET_TITLES, legend)) if len(sets) > 1 else None,
     }
-
-
-def _page_table(results: Results, legend: Legend) -> Table:
-    return score_table(results.metrics, PAGE_COLUMNS, legend.labels, results.details["warmup_windows"])
 
 
 def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
@@ -192,23 +196,6 @@ def _against(mse: float, other: float) -> str:
 def _best_method(metrics: Scores) -> str:
     """The method with the lowest MSE; among the references if no method was run."""
     return min(with_structure(metrics) or in_order(metrics), key=lambda row: metrics[row]["mse"])
-
-
-def _worst_scenes(means: Mapping[str, float], films: Sequence[str]) -> list[tuple[str, float, str | None]]:
-    """The scenes with the largest MSE, and the film of each in the player; None if it is not there."""
-    worst = sorted(means.items(), key=lambda item: -item[1])[:WORST_SCENES]
-    return [(scene, mse, next((film for film in films if film.startswith(scene)), None)) for scene, mse in worst]
-
-
-def _set(one: Results, legend: Legend) -> dict[str, Any]:
-    """Template values of a test set other than the simulated one."""
-    return {
-        "title": SET_TITLES.get(one.name, one.name),
-        "about": SET_ABOUT.get(one.name, ""),
-        "scenes": len(one.details["scenes"]),
-        "frames": one.details["frames"],
-        "scores": _page_table(one, legend),
-    }
 
 
 def _pictures(manifest: Manifest) -> dict[str, Any]:

@@ -5,7 +5,9 @@ sine of twice the angle, because a lossy picture of the angle itself would blur 
 """
 
 import base64
+import json
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -14,8 +16,9 @@ import matplotlib
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
 
-from polarnet.reports.html import embedded_json, script, template
 from polarnet.reports.legend import Legend, with_structure
 from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, paper_map, table_of
 from polarnet.storage.panels import NO_EVENTS, Panel
@@ -36,6 +39,24 @@ COLOURS = {
     "error": table_of(matplotlib.colormaps["magma"]),
     "paper": paper_map(torch.ones(1, 256), torch.arange(256)[None] * (torch.pi / 256))[0],  # scaled with DoLP
 }
+
+
+def template(name: str) -> Template:
+    """Load a page template of this package: every value is escaped, and a missing value is an error."""
+    environment = Environment(
+        loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    return environment.get_template(name)
+
+
+def embedded_json(content: Any) -> Markup:
+    """JSON for a script element; `<` is escaped, so that no text can end the element."""
+    return Markup(json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"))
+
+
+def script(name: str) -> Markup:
+    """A JavaScript file of this package."""
+    return Markup((files("polarnet.reports") / name).read_text(encoding="utf-8"))
 
 
 class Map(NamedTuple):

@@ -1,13 +1,15 @@
-"""Labelled pictures of a sequence, side by side: events, DoLP, AoLP, S0 and polarization as hue, saturation, value.
+"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4.
 
 `plot_events`, `plot_frame` and `plot_prediction` return pictures that a notebook shows and that `save` writes.
 """
 
 import functools
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import av
 import cv2
 import numpy as np
 import torch
@@ -27,12 +29,15 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.videos import VideoWriter, with_even_sides
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
 from polarnet.storage.frames import Polarization
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
+CODEC, PIXELS = "libx264", "yuv420p"  # the one pair that every browser plays
+QUALITY = {"preset": "ultrafast", "crf": "18", "threads": "1"}  # a second thread would take the network's core
+LAYOUT = {"movflags": "hybrid_fragmented", "flush_packets": "1"}  # plays after a kill, an ordinary MP4 once closed
+SECONDS_PER_FRAGMENT = 2  # the most that a kill loses
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
 GAP, MARGIN = 8, 12
 FONT_SIZE = 13  # pixels
@@ -43,6 +48,60 @@ EMPTY = 60  # pixels between the text below a picture and the colour bar, or the
 
 Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
 """Maps of a row of a sheet, by caption."""
+
+
+class VideoWriter:
+    """Writes pictures of one size into an MP4; as a context manager it closes the file.
+
+    Odd sides are made even by repeating the last row or column. After a kill, the file plays up to its last complete
+    fragment. ValueError if a picture has another size than the first.
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from polarnet.reports import VideoWriter
+    >>> with VideoWriter(Path("grey.mp4"), rate_hz=30.0) as video:
+    ...     for level in range(0, 250, 10):
+    ...         video.add(np.full((32, 48, 3), level, np.uint8))
+    """
+
+    def __init__(self, path: Path, rate_hz: float):
+        """`rate_hz` pictures a second; the file is created with the first picture."""
+        self.path, self.rate = path, Fraction(rate_hz).limit_denominator(100_000)
+        self._file: av.container.OutputContainer | None = None
+        self._stream: Any = None
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self.close()
+
+    def add(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Add a picture in RGB."""
+        even = with_even_sides(picture)
+        if self._file is None:
+            self._file = av.open(str(self.path), "w", format="mp4", options=LAYOUT)
+            self._stream = self._file.add_stream(CODEC, rate=self.rate, options=QUALITY)
+            self._stream.height, self._stream.width, self._stream.pix_fmt = *even.shape[:2], PIXELS
+            self._stream.codec_context.gop_size = max(1, round(SECONDS_PER_FRAGMENT * self.rate))
+        if even.shape[:2] != (self._stream.height, self._stream.width):
+            expected = f"{self._stream.height} x {self._stream.width}"
+            raise ValueError(f"{self.path}: expected pictures of {expected} px, got {even.shape[0]} x {even.shape[1]}")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+        self._file.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Write the pictures that the encoder still holds, and the file's index."""
+        if self._file is not None:
+            self._file.mux(self._stream.encode())
+            self._file.close()
+            self._file = None
+
+
+def with_even_sides(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """The picture with its last row and column repeated where a side is odd, because codecs want even sides."""
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 class Sheet:
@@ -108,10 +167,8 @@ class Sheet:
         if left - zero < MARGIN + _font().getlength(text) + EMPTY:
             return
         bar = Image.fromarray(DOLP_TABLE[None]).resize(BAR, Image.Resampling.NEAREST)
-        for part, place in (
-            (_line("DoLP 0", zero), left - 6 - zero), (_line("1", one), left + length + 4)
-        ):  # fmt: skip
-            sheet.paste(part, (place, top))
+        sheet.paste(_line("DoLP 0", zero), (left - 6 - zero, top))
+        sheet.paste(_line("1", one), (left + length + 4, top))
         sheet.paste(bar, (left, top + (LINE - height) // 2))
 
 
@@ -208,9 +265,7 @@ def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = 
 def _line(text: str, width: int) -> Image.Image:
     """A line of text, for reading only; what does not fit into the width is cut off."""
     line = Image.new("RGB", (width, LINE), "white")
-    ImageDraw.Draw(line).text(
-        (0, LINE - 6), text, fill=TEXT_COLOUR, font=_font(), anchor="ls"
-    )  # base line above the edge
+    ImageDraw.Draw(line).text((0, LINE - 6), text, fill=TEXT_COLOUR, font=_font(), anchor="ls")  # on the base line
     return line
 
 

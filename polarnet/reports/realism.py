@@ -1,7 +1,6 @@
 """The realism page of `polarnet fit-sensor`: each recording beside its simulated twin."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -9,22 +8,15 @@ from matplotlib.figure import Figure
 
 from polarnet.characterization.twin import INTERVAL_EDGES_US, Comparison
 from polarnet.reports.figures import PAGE, styled, svg
-from polarnet.reports.html import template
+from polarnet.reports.player import template
 
 LABELS = {"recording": "recording", "twin": "simulated twin"}
 
 
-class FitRow(NamedTuple):
-    """A row of the table of estimates, as text."""
-
-    parameter: str
-    estimate: str
-    error: str
-    source: str
-
-
-def realism_page(name: str, rows: Sequence[FitRow], notes: Sequence[str], comparisons: Sequence[Comparison]) -> str:
-    """The page as HTML; it needs no other file and no network."""
+def realism_page(
+    name: str, rows: Sequence[Sequence[str]], notes: Sequence[str], comparisons: Sequence[Comparison]
+) -> str:
+    """The page as HTML; `rows` are parameter, estimate, standard error and source. It needs no other file."""
     sections = [(one, svg(realism_figure(one))) for one in comparisons]
     return template("realism.html.jinja").render(title=name, rows=rows, notes=notes, sections=sections)
 

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from polarnet.captures.alignment import Alignment
@@ -17,8 +16,8 @@ from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.inspection import Inspection
+from polarnet.reports.figures import LIGHT, show_picture, tile_grid
 from polarnet.reports.maps import (
-    DOLP_COLOURS,
     dolp_image,
     encode_png,
     event_full_scale,
@@ -59,15 +58,12 @@ def draw_calibration(target: Calibrated, config: RecordingsConfig, path: Path) -
 
 
 def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
-    """Write the paper's Fig. 8 of a calibrated target as PATH.png and PATH.pdf.
+    """Write the paper's Fig. 8 of a calibrated target as PATH.png and PATH.pdf; a column is a time.
 
-    A column is a time. Rows are event tensors of the window before it and intensities, each at 0, 45, 90 and 135
-    degrees, and DoLP. Intensities are scaled to the brightest pixel of the sequence.
+    Intensities are scaled to the brightest pixel of the sequence.
     """
     chosen = np.linspace(1, len(frames.t_us) - 1, min(SEQUENCE_COLUMNS, len(frames.t_us) - 1)).round().astype(int)
-    height, width = frames.dolp.shape[1:]
-    figure = Figure(figsize=(1.4 * len(chosen) + 0.8, (1.4 * height / width + 0.06) * 9 + 0.3), layout="constrained")
-    grid = figure.subplots(9, len(chosen), squeeze=False)
+    figure, grid = tile_grid(9, len(chosen), frames.dolp.shape[1:], bar_row=8)
     white = float(frames.intensity.max()) or 1.0
     for column, k in zip(grid.T, chosen.tolist(), strict=True):
         start, stop = (int(t) for t in frames.t_us[k - 1 : k + 1])
@@ -76,14 +72,11 @@ def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
         pictures = [event_image(tensor, full_scale) for tensor in tensors]
         pictures += [intensity_image(plane / white) for plane in frames.intensity[k]]
         for axes, picture in zip(column, [*pictures, dolp_image(frames.dolp[k])], strict=True):
-            axes.imshow(picture)
-            axes.set(xticks=[], yticks=[])
+            show_picture(axes, picture, LIGHT)
         column[0].set_title(f"{stop / 1000:.0f} ms", fontsize=8)
     names = [f"{kind} {angle}°" for kind in ("events", "intensity") for angle in POLARIZER_ANGLES_DEG]
     for axes, name in zip(grid[:, 0], [*names, "DoLP"], strict=True):
         axes.set_ylabel(name, fontsize=7)
-    bar = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), ax=grid[8, :].tolist(), ticks=[0, 0.5, 1])
-    bar.ax.tick_params(labelsize=7)
     write_figure(figure, path)
 
 

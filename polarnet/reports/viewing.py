@@ -29,11 +29,10 @@ APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "
 def films_of(
     path: Path, sequences: Sequence[str] = (), read: Callable[[Path], Recording] = read_recording
 ) -> list[Film]:
-    """Films of a store, of a folder with stores, or of a camera's file, which `read` reads.
+    """Films of a store, of a folder with stores (all of a sequence in one), or of a camera's file, which `read` reads.
 
-    A folder gives the events, frames and recovery of a sequence in one film. Without `sequences`, the first `MAX_FILMS`
-    of each store are read. ValueError for an unknown sequence, with the known names; FileNotFoundError if there is
-    nothing to show.
+    Without `sequences`, the first `MAX_FILMS` of each store are read. ValueError for an unknown sequence;
+    FileNotFoundError if there is nothing to show.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: expected a store, a folder with stores or a recording; there is no such path")

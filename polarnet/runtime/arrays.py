@@ -29,7 +29,8 @@ def as_tensor(name: str, values: Any) -> Shaped[Tensor, "*shape"]:
         # torch warns about read-only arrays and refuses negative strides
         unfit = not native.flags.writeable or min(native.strides, default=0) < 0
         return torch.from_numpy(native.copy() if unfit else native)
-    if isinstance(values, Tensor) and values.layout == torch.strided and not _exotic(values):
+    exotic = isinstance(values, Tensor) and (values.is_complex() or values.is_quantized or values.is_meta)
+    if isinstance(values, Tensor) and values.layout == torch.strided and not exotic:
         return values
     kind = f" of {values.dtype}" if isinstance(values, Array) else ""
     raise TypeError(
@@ -138,10 +139,9 @@ def floats(name: str, values: Any, axes: str) -> Float[Tensor, "*shape"]:
 
 
 def fractions(name: str, values: Any, axes: str, quantity: str = "values") -> Float[Tensor, "*shape"]:
-    """Convert values in [0, 1] as `floats` does, clipping float32 rounding errors.
+    """Convert values in [0, 1] as `floats` does, clipping float32 rounding errors; the ValueError names a divisor.
 
-    Raises ValueError also for values out of range, with the number to divide by. Integers are refused even within the
-    range, because an array does not say which integer is white.
+    Integers are refused even within the range, because an array does not say which integer is white.
     """
     tensor = as_tensor(name, values).detach().cpu()
     check_shape(name, values, axes)
@@ -150,10 +150,6 @@ def fractions(name: str, values: Any, axes: str, quantity: str = "values") -> Fl
     check_range(name, tensor, 0, 1, quantity)
     check_floating(name, tensor)
     return tensor.clamp(0, 1)
-
-
-def _exotic(values: Tensor) -> bool:
-    return values.is_complex() or values.is_quantized or values.is_meta
 
 
 def _fits(shape: tuple[int, ...], named: list[str]) -> bool:

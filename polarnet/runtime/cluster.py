@@ -30,10 +30,9 @@ def pmap(
 ) -> list[Result]:
     """`[function(item) for item in items]`, in that order, with a progress bar called `label`.
 
-    `address` names a Dask scheduler (extra `cluster`). Without it, `workers` processes share the items; one worker
-    means this process. If a worker dies, only its current items are lost and handed out again. RuntimeError names the
-    unfinished items after workers have died `ATTEMPTS` times without one result, or the scheduler if that has ended. An
-    exception raised by `function` ends the map and propagates unchanged.
+    `address` names a Dask scheduler (extra `cluster`); without it, `workers` processes share the items, and one worker
+    means this process. Items of a worker that dies are handed out again. RuntimeError names the unfinished items after
+    `ATTEMPTS` deaths without a result, or a scheduler that has ended; exceptions of `function` end the map unchanged.
     """
     with Bar(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
         if address is not None:

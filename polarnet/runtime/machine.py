@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import numba
@@ -61,6 +62,16 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def memory() -> tuple[int, int]:
+    """Free and total memory of this machine in bytes; only Linux states how much is free, others count as empty."""
+    if sys.platform == "linux":
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
+        return free, total
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return total, total
+
+
 def limit_threads(threads: int) -> None:
     """Let torch and numba use `threads` threads in this process."""
     torch.set_num_threads(threads)
@@ -68,25 +79,17 @@ def limit_threads(threads: int) -> None:
 
 
 @contextmanager
-def torch_threads(number: int) -> Iterator[None]:
-    """Run torch on this number of threads."""
+def one_thread() -> Iterator[None]:
+    """Run torch on one thread, so that its bytes do not depend on the number of threads.
+
+    torch computes the last values of each thread's part one by one, and rounds them differently from whole vectors.
+    """
     threads = torch.get_num_threads()
-    torch.set_num_threads(number)
+    torch.set_num_threads(1)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread, so that its bytes do not depend on the number of threads.
-
-    Threads split an image between them. torch computes the last values of each part one by one, and rounds them
-    differently from whole vectors.
-    """
-    with torch_threads(1):
-        yield
 
 
 def on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
@@ -128,9 +131,7 @@ def bf16_units(device: torch.device) -> list[str]:
 
 def precision_on(device: torch.device, precision: str) -> str:
     """fp32 or bf16: `precision`, or for auto, bf16 if the device has units for it."""
-    if precision == "auto":
-        return "bf16" if bf16_units(device) else "fp32"
-    return precision
+    return precision if precision != "auto" else "bf16" if bf16_units(device) else "fp32"
 
 
 def end_with_parent(parent: int | None = None) -> None:

@@ -88,14 +88,10 @@ def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
             keys = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
             close = " or ".join(difflib.get_close_matches(name, names, cutoff=CLOSE))
             return f"{'.'.join(path)} is not a setting; {keys}{f'; did you mean {close}?' if close else ''}"
-        config_class = _without_none(typing.get_type_hints(config_class)[name])
+        hint = typing.get_type_hints(config_class)[name]
+        kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
+        config_class = kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint
     return None
-
-
-def _without_none(hint: Any) -> Any:
-    """The type X of an annotation `X | None`; other annotations are returned unchanged."""
-    kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
-    return kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint
 
 
 def _in_words(config_class: Any, error: ErrorDetails) -> str:

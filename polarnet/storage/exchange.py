@@ -159,5 +159,5 @@ def h5py_module() -> Any:
     try:
         import h5py
     except ImportError:
-        raise RuntimeError(f"HDF5 needs h5py: {installation('hdf5')}") from None
+        raise RuntimeError(f"HDF5 needs h5py: {installation('recordings')}") from None
     return h5py

@@ -143,7 +143,10 @@ class Store:
             raise ValueError(f"{path}: the store was never finished; run the stage that writes it again")
         if header.get("checksum") != _checksum(header):
             raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
-        return cls(os.fspath(path), header)
+        try:
+            return cls(os.fspath(path), header)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}: the attributes in zarr.json are not a store's: {error}; {REPAIR}") from error
 
     def missing(self) -> list[str]:
         """Sequences of the parts that are not written yet, in the store's order."""
@@ -205,9 +208,9 @@ class Store:
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows of a sequence from `start` up to `stop` (None: the end); ValueError names an unreadable column."""
         group, records, arrays = self._open_part(sequence)
-        first, end = records[sequence]["rows"]
-        start, stop = first + start, end if stop is None else min(first + stop, end)
         try:
+            first, end = records[sequence]["rows"]
+            start, stop = first + start, end if stop is None else min(first + stop, end)
             if name not in arrays:
                 arrays[name] = group[name]
             values = np.asarray(arrays[name][start:stop])

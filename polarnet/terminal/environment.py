@@ -13,10 +13,9 @@ STOPPED = "stopped; finished work is kept, and the same command again continues 
 
 
 def let_threads_sleep() -> None:
-    """Let waiting OpenMP threads sleep after a short while; call this before anything loads torch.
+    """Let waiting OpenMP threads sleep soon instead of taking cores from others; call this before anything loads torch.
 
-    Threads that spin would take the cores from another process. They do not sleep at once, because a network is many
-    short operations. Variables that are set already stay.
+    Not at once, because a network is many short operations. Variables that are set already stay.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # turns of a loop

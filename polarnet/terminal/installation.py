@@ -9,10 +9,7 @@ INSTALLED = PACKAGE / "config" / "settings"
 EXTRAS = {
     "pipeline": "dvc repro",
     "cluster": "stages on a Dask cluster",
-    "hdf5": "HDF5 files",
-    "recordings": "camera files of DSEC and faery",
-    "rosbag": "bags of ROS",
-    "live": "a running camera",
+    "recordings": "HDF5 files, AEDAT4, bags of ROS, a running camera",
     "remote": "stores in a bucket",
     "export": "polarnet onnx",
     "sweep": "sweeps",

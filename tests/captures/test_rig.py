@@ -64,13 +64,8 @@ def test_a_folder_of_captures_goes_into_recover_calibrated(rig, config, project_
 def test_the_rig_writes_eight_captures_and_says_what_is_true_of_them(rig):
     root, truth = rig
     assert len(find_captures(root / "one")) == 8
-    written = json.loads((root / "one" / "truth.json").read_text())
-    assert written["start_us"] == dict(truth.start_us)
     assert len(set(truth.start_us.values())) == 8  # random delays
     assert all(80_000 <= start <= 250_000 for start in truth.start_us.values())
-    with np.load(root / "one" / "truth.npz") as frames:
-        assert frames["dolp"].shape == (10, 16, 24)
-        assert frames["dolp"].mean() == pytest.approx(written["mean_dolp"], abs=1e-6)
 
 
 def test_start_times_by_the_landmark_are_right_within_one_picture_and_refined_within_a_millisecond(calibrated):

@@ -16,7 +16,9 @@ def project(tmp_path):
     return tmp_path / "lake"
 
 
-def test_the_stages_depend_on_the_version_instead_of_the_code(project, project_root):
+def test_the_stages_depend_on_the_version_instead_of_the_code_and_presets_work(
+    project, project_root, monkeypatch, capsys
+):
     yaml = YAML(typ="safe")
     own, clone = (yaml.load(root / "dvc.yaml")["stages"] for root in (project, project_root))
     assert list(own) == list(clone)
@@ -30,9 +32,6 @@ def test_the_stages_depend_on_the_version_instead_of_the_code(project, project_r
     rows, others = (yaml.load(root / "params.yaml") for root in (project, project_root))
     assert not any(row["needs"].startswith("polarnet/") for row in rows.pop("rows").values())
     assert rows == {key: value for key, value in others.items() if key != "rows"}
-
-
-def test_presets_and_stages_work_in_it(project, monkeypatch, capsys):
     monkeypatch.chdir(project)
     assert main(["preset", "smoke"]) == 0
     assert "params.yaml now holds experiment smoke" in capsys.readouterr().out

@@ -30,13 +30,7 @@ def fail(folder, error, *files):
         raise error
 
 
-def test_a_second_run_leaves_nothing_of_the_first(tmp_path):
-    write(tmp_path / "out", "png/0.png", "png/1.png", "video.mp4")
-    write(tmp_path / "out", "png/0.png")
-    assert names(tmp_path) == ["out/png/0.png", f"out/{MARKER}"]
-
-
-def test_files_move_into_the_folder_at_the_end_alone(tmp_path):
+def test_files_move_into_the_folder_at_the_end_alone_and_a_second_run_leaves_nothing_of_the_first(tmp_path):
     out = tmp_path / "out"
     with run_folder(out, "recover") as partial:
         (partial / "0.png").touch()
@@ -44,6 +38,8 @@ def test_files_move_into_the_folder_at_the_end_alone(tmp_path):
         assert not out.exists()
     assert names(tmp_path) == ["out/0.png", f"out/{MARKER}"]
     assert not partial.exists()
+    write(out, "png/1.png", "video.mp4")
+    assert names(tmp_path) == ["out/png/1.png", f"out/{MARKER}", "out/video.mp4"]
 
 
 def test_a_folder_with_other_files_is_refused_and_untouched(tmp_path):
@@ -59,13 +55,10 @@ def test_a_folder_with_other_files_is_refused_and_untouched(tmp_path):
     assert names(tmp_path) == ["out/events.h5", f"out/{MARKER}", "thesis.tex"]
 
 
-def test_a_run_that_fails_before_its_first_file_leaves_no_folder(tmp_path):
-    with pytest.raises(ValueError, match="refused"):
+def test_a_run_that_is_stopped_keeps_its_files_apart_and_the_next_run_replaces_them(tmp_path, capsys):
+    with pytest.raises(ValueError, match="refused"):  # before its first file
         fail(tmp_path / "a" / "out", ValueError("refused"), f"{WORK}/imported")
     assert not any(tmp_path.iterdir())
-
-
-def test_a_run_that_is_stopped_keeps_its_files_apart_and_the_next_run_replaces_them(tmp_path, capsys):
     write(tmp_path / "out", "before.png")
     with pytest.raises(KeyboardInterrupt):
         fail(tmp_path / "out", KeyboardInterrupt(), "0.png")

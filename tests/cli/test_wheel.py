@@ -58,24 +58,3 @@ def test_the_wheel_holds_the_package_alone_with_the_settings(distributions, proj
     patterns = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
     expected = [path for pattern in patterns for path in project_root.glob(pattern)]
     assert settings == {str(path.relative_to(project_root)): path.read_bytes() for path in expected}
-
-
-def test_a_wheel_reads_its_own_settings_outside_a_clone_and_those_of_the_clone_inside(
-    distributions, project_root, tmp_path
-):
-    with zipfile.ZipFile(distributions[1]) as wheel:
-        wheel.extractall(tmp_path / "installed")
-    (tmp_path / "empty").mkdir()
-    environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
-
-    def printed(script, folder):
-        command = [sys.executable, "-c", f"from polarnet.cli.project import settings_root; {script}"]
-        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
-
-    assert printed("print(settings_root())", project_root / "tests").strip() == str(project_root)
-    load = "from polarnet.config.tree import load; print(load(settings_root(), ['seed=7', 'experiment=smoke']).seed)"
-    assert printed(f"print(settings_root()); {load}", tmp_path / "empty").split() == [
-        str(tmp_path / "installed" / "polarnet" / "config" / "settings"), "7",
-    ]  # fmt: skip
-    sensor = "from polarnet.simulation import SENSORS; print(SENSORS['noisy'].cutoff_hz)"
-    assert printed(sensor, tmp_path / "empty").strip() == "30.0"

@@ -12,12 +12,10 @@ from pathlib import Path
 
 import preloaded
 import pytest
-import torch
 
 from polarnet.cli import main
 from polarnet.config.experiments import GROUPS, check_overrides, preset_names, preset_values, write_preset
-from polarnet.config.tree import Config, input_folder, load, with_lpips
-from polarnet.simulation.emulator import emulate
+from polarnet.config.tree import Config, load, with_lpips
 
 
 @pytest.fixture
@@ -40,15 +38,9 @@ def edit(project: Path, old: str, new: str) -> None:
     ("override", "message"),
     [
         ("emulate.contrast_threshold_on=-0.2", r"emulate\.contrast_threshold_on: expected >= 0\.01"),
-        ("train.epochs=0", r"train\.epochs: expected"),
-        ("methods.cf.cutoff_hz=-1.0", r"methods\.cf\.cutoff_hz: expected"),
         ("benchmark.methods=[magic]", r"benchmark\.methods\[0\]: expected one of zeros, .*, ours, got 'magic'"),
-        ("ingest.source=camera", r"ingest\.source: expected one of"),
         ("networks.polarnet.reach=1000000000", r"networks\.polarnet\.reach: expected <= 1000"),
-        ("networks.paper.swin_depth=1000000000", r"networks\.paper\.swin_depth: expected <= 100"),
-        ("runtime.devices=1000000000", r"runtime\.devices: expected <= 4096"),
         ("network=resnet", r"network: expected one of paper"),
-        ("lpips.backbone=resnet", r"lpips\.backbone: expected one of"),
         ("train.epochs=many", r"^train\.epochs: expected a valid integer, got 'many'$"),
         ("emulate.randomise={cutof_hz:[30,300]}", r"^emulate.randomise.cutof_hz: expected one of .*, cutoff_hz, .*'$"),
         (
@@ -75,31 +67,42 @@ def test_a_wrong_key_value_or_choice_is_refused_with_those_that_are_allowed(proj
 
 
 @pytest.mark.parametrize(
-    ("stage", "override", "refusal"),
+    ("stage", "overrides", "refusal"),
     [
-        ("train", "experiment=smok", "experiment: there is no 'smok'; "),
-        ("trial", "experiment=smok", "experiment: there is no 'smok'; "),
-        ("synthesize", "synthesize.duration_s=-1.0", "synthesize.duration_s: expected > 0"),
+        ("train", ["experiment=smok"], "configuration error: experiment: there is no 'smok'; "),
+        ("trial", ["experiment=smok"], "configuration error: experiment: there is no 'smok'; "),
+        ("synthesize", ["synthesize.duration_s=-1.0"], "configuration error: synthesize.duration_s: expected > 0"),
+        ("ingest", ["ingest.source=folder", "ingest.root=EMPTY"], "ingest.root=EMPTY: no files there; put your files"),
+        (
+            "sets",
+            ["benchmark.sets=[simulated,measured]", "sets.measured_root=EMPTY"],
+            "sets.measured_root=EMPTY: no",
+        ),
+        ("import_recordings", ["recordings.enabled=true", "recordings.root=EMPTY"], "recordings.root=EMPTY: no files"),
     ],
 )
-def test_a_stage_refuses_a_wrong_value_before_it_runs_anything(project_root, tmp_path, stage, override, refusal):
-    done = preloaded.run_stage(project_root, stage, [override, f"paths.data={tmp_path}"])
+def test_a_stage_refuses_a_wrong_value_and_an_empty_folder_in_one_line(
+    project_root, tmp_path, stage, overrides, refusal
+):
+    (tmp_path / "empty").mkdir()
+    values = [override.replace("EMPTY", str(tmp_path / "empty")) for override in overrides]
+    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
     assert done.returncode == 1
-    assert done.stdout.startswith(f"configuration error: {refusal}")
+    assert done.stdout.startswith(refusal.replace("EMPTY", str(tmp_path / "empty")))
     assert "Traceback" not in done.stdout
-    assert list(tmp_path.iterdir()) == []
+    assert "configuration" not in refusal or not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        (["ablation=similarity"], r"loss\.ssim is 1\.0 already in params\.yaml"),
-        (["experiment=smoke", "ablation=similarity"], r"loss\.ssim is 1\.0 already in experiment=smoke"),
-        (["network=paper", "ablation=memories"], r"networks\.polarnet\.memories has no effect on network=paper"),
+        (["ablation=similarity"], r"loss\.ssim=1\.0 stands already in params\.yaml, "),
+        (["experiment=smoke", "ablation=similarity"], r"loss\.ssim=1\.0 stands already in experiment=smoke, "),
+        (["network=paper", "ablation=memories"], r"networks\.polarnet\.memories=.* is of another network than paper; "),
     ],
 )
 def test_an_ablation_that_changes_nothing_is_refused_with_the_value_there_is(project_root, overrides, reason):
-    with pytest.raises(ValueError, match=f"ablation=[a-z]+ changes nothing: {reason}$"):
+    with pytest.raises(ValueError, match=f"ablation=[a-z]+ changes nothing: {reason}"):
         load(project_root, overrides)
 
 
@@ -127,52 +130,6 @@ def test_a_params_yaml_with_more_than_values_is_refused_before_hydra_reads_it(pr
     (project / "params.yaml").write_text(f"{text}\n")
     with pytest.raises(ValueError, match=message):
         load(project)
-
-
-def test_a_folder_without_files_of_the_users_is_refused_in_one_line_that_tells_a_queued_experiment_where_they_are(
-    project_root, tmp_path, monkeypatch
-):
-    photographs = Path("data", "photographs")
-    copy = tmp_path / ".dvc" / "tmp" / "exps" / "tmp1"
-    for project in (tmp_path, copy):
-        (project / photographs).mkdir(parents=True)
-        (project / photographs / "README.md").write_text("Put your photographs here.")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=r"ingest\.root=data/photographs: no files there; put your files there"):
-        input_folder("ingest.root", str(photographs))
-    monkeypatch.chdir(copy)
-    with pytest.raises(SystemExit, match=f"queue it with -S ingest.root={tmp_path / photographs}, or `dvc add`"):
-        input_folder("ingest.root", str(photographs))
-    (copy / photographs / "a.png").touch()
-    assert input_folder("ingest.root", str(photographs)) == photographs
-
-
-@pytest.mark.parametrize(
-    ("stage", "overrides"),
-    [
-        ("ingest", ["ingest.source=folder", "ingest.root={}"]),
-        ("sets", ["benchmark.sets=[simulated,measured]", "sets.measured_root={}"]),
-        ("import_recordings", ["recordings.enabled=true", "recordings.root={}"]),
-    ],
-)
-def test_a_stage_without_its_input_files_ends_without_a_traceback(project_root, tmp_path, stage, overrides):
-    (tmp_path / "empty").mkdir()
-    values = [override.format(tmp_path / "empty") for override in overrides]
-    done = preloaded.run_stage(project_root, stage, [*values, f"paths.data={tmp_path / 'data'}"])
-    assert done.returncode == 1
-    assert done.stdout.startswith(f"{values[-1]}: no files there; put your files there")
-    assert "Traceback" not in done.stdout
-
-
-@pytest.mark.parametrize("group", GROUPS)
-def test_every_preset_composes(project_root, group):
-    for name in preset_names(project_root, group):
-        config = load(project_root, [f"{group}={name}"])
-        for key, value in preset_values(project_root, group, name).items():
-            node = config
-            for part in key.split("."):
-                node = getattr(node, part)
-            assert node == value, f"{group} {name}: {key}"
 
 
 E2P = "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}"
@@ -251,11 +208,13 @@ def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root)
     assert with_lpips(load(project_root, ["benchmark.lpips=false"]), "benchmark", refuse) is None
 
 
-def test_a_preset_holds_only_what_differs_and_no_sensor_is_called_like_an_experiment(project_root):
+def test_every_preset_composes_holds_only_what_differs_and_no_sensor_is_called_like_an_experiment(project_root):
     whole = dataclasses.asdict(load(project_root))
     for group in GROUPS:
         for name in preset_names(project_root, group):
+            chosen = load(project_root, [f"{group}={name}"])
             for key, value in preset_values(project_root, group, name).items():
+                assert operator.attrgetter(key)(chosen) == value, f"{group} {name}: {key}"
                 stands = functools.reduce(operator.getitem, key.split("."), whole)
                 undoes = key == "emulate.randomise" or name in ("paper_small", "shipped_whole")  # of another preset
                 assert stands != value or undoes, f"{group} {name}: {key}"
@@ -324,18 +283,6 @@ def test_a_sensor_is_v2es_for_hydra_and_for_dvc_alike_and_leaves_the_rest_as_it_
     by_dvc = load(project)
     assert dataclasses.replace(by_hydra.emulate, model="exact") == by_dvc.emulate  # the experiment has its own model
     assert by_dvc.synthesize == by_hydra.synthesize
-
-
-def test_a_clean_sensor_sees_nothing_in_still_light_and_a_noisy_one_what_its_rates_say(project_root):
-    still = torch.full((2, 1, 100, 100), 0.0)  # dark, where shot noise has its full rate
-    counts = {}
-    for name in SENSORS:
-        config = load(project_root, [f"sensor={name}"]).emulate
-        (events,), _ = emulate(still, torch.tensor([0, 1_000_000]), config, key=1)
-        counts[name] = len(events)
-    assert counts["clean"] == 0
-    assert counts["default"] < 1000
-    assert counts["noisy"] == pytest.approx(5.1 * 100 * 100, rel=0.05)  # shot noise and leak, events a second
 
 
 def test_ranges_are_written_whole_and_taken_back_whole(project):

@@ -44,6 +44,9 @@ def test_a_baseline_is_trained_for_a_row_that_needs_it_and_not_for_one_with_a_fi
     assert load(project_root).used_baselines == ["e2v"]
     assert load(project_root, ["rows.e2v.needs=data/external/mine.safetensors"]).used_baselines == []
     assert load(project_root, ["benchmark.methods=[cf,ours]"]).used_baselines == []
+    unused = r"no row of benchmark.methods uses the weights of baselines.e2p.*data/train/e2p"
+    with pytest.raises(ValueError, match=unused):
+        load(project_root, ["baseline=e2p"])
 
 
 def test_a_row_takes_the_weights_that_its_entry_names(project_root, tmp_path):
@@ -51,13 +54,6 @@ def test_a_row_takes_the_weights_that_its_entry_names(project_root, tmp_path):
     assert config.weights_of("ours") == tmp_path / "ours" / "best.safetensors"
     assert config.weights_of("e2v") == Path("data/external/mine.safetensors")
     assert config.weights_of("e2p") is None
-
-
-def test_a_baseline_that_no_row_uses_is_not_trained(project_root):
-    with pytest.raises(
-        ValueError, match=r"no row of benchmark.methods uses the weights of baselines.e2p.*data/train/e2p"
-    ):
-        load(project_root, ["baseline=e2p"])
 
 
 @pytest.mark.parametrize(

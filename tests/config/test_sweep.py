@@ -38,15 +38,14 @@ def test_rows_are_ranked_by_validation_scores_and_seeds_become_mean_and_standard
     assert [row["jobs"] for row in rows] == [["0", "1"], ["2"], ["10"]]  # by test scores 2 would be the first
     assert rows[0]["seeds"] == [1, 2]
     assert rows[0]["overrides"] == ["loss.ssim=0.0"]
-    assert rows[0]["validation"]["mse"] == {"mean": pytest.approx(0.04), "std": pytest.approx(0.0002**0.5)}
-    assert rows[1]["test"]["mse"] == {"mean": 0.01, "std": None}
-
-
-def test_the_ranking_has_scores_failures(sweep):
-    lines = ranking(sweep_rows(sweep_points(sweep))).splitlines()
+    assert (rows[0]["validation_mse"], rows[0]["validation_mse_std"]) == pytest.approx((0.04, 0.0002**0.5))
+    assert (rows[1]["test_mse"], rows[1]["test_mse_std"]) == (0.01, None)
+    lines = ranking(rows).splitlines()
     assert lines[1].split() == ["0.0400", "±", "0.0141", "0.0500", "±", "0.0141", "2", "loss.ssim=0.0"]
     assert lines[3].split() == ["-", "-", "0", "of", "1", "loss.mse=-1.0"]
     assert lines[4].strip() == "seed 1 failed: train: configuration error: loss.mse: expected >= 0"
+    keys, scores = swept_axes(rows)  # those that differ, of finished points
+    assert (keys, scores) == ({"loss.ssim": ["0.0", "1.0"]}, pytest.approx([0.04, 0.08]))
 
 
 def test_overrides_that_all_points_share_stand_once_below_the_ranking(tmp_path, write_trial):
@@ -62,7 +61,7 @@ def test_a_failed_seed_counts_in_no_mean_and_is_named(tmp_path, write_trial):
     write_trial(tmp_path / "1", ["seed=2"], seed=2, validation={"mse": 9.0, "psnr": 14.0}, failure="benchmark: killed")
     (row,) = sweep_rows(sweep_points(tmp_path))
     assert (row["seeds"], row["failed_seeds"]) == ([1], [2])
-    assert row["validation"]["mse"] == {"mean": 0.03, "std": None}
+    assert (row["validation_mse"], row["validation_mse_std"]) == (0.03, None)
     assert row["notes"] == ["seed 2 failed: benchmark: killed"]
 
 
@@ -77,12 +76,6 @@ def test_a_sweep_with_a_failed_point_writes_its_tables_and_ends_with_an_error(sw
     # Student's t of 95 % and two seeds is 12.71: 0.04 -+ 12.71 * 0.01414 / sqrt(2)
     assert "Best: loss.ssim=0.0, validation MSE 0.0400, 95 % interval over 2 seeds -0.0871 to 0.1671." in printed
     assert (sweep / "comparison.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_axes_of_the_plot_are_the_keys_that_differ_and_only_finished_points_have_lines(sweep):
-    keys, scores = swept_axes(sweep_rows(sweep_points(sweep)))
-    assert keys == {"loss.ssim": ["0.0", "1.0"]}
-    assert scores == pytest.approx([0.04, 0.08])
 
 
 def test_a_job_is_finished_for_its_own_values_and_inputs_alone_and_says_what_changed(tmp_path):

@@ -215,5 +215,5 @@ def test_nobody_at_the_address_is_reported(dv):
 
 def test_without_dv_processing_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "dv_processing", None)
-    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[live\]' in the clone"):
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[recordings\]' in the clone"):
         LiveCamera("dv://127.0.0.1:7777", MOSAIC, idle_s=1.0)

@@ -1,6 +1,8 @@
+import subprocess
+
 import torch
 
-from polarnet.reports.artefacts import read_results, training_history
+from polarnet.reports.artefacts import facts, read_results, training_history
 from polarnet.storage.frames import FrameStore
 
 
@@ -18,3 +20,19 @@ def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
     assert history.best_epoch == 1
     assert list(history.loss) == ["total", "mse"]
     assert history.validation["psnr"] == [10.0, 11.0, 12.0]
+
+
+def test_edited_code_is_said_but_what_the_pipeline_writes_is_no_edit(tmp_path):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+        subprocess.run(["git", *identity, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    for name in ("code.py", "dvc.lock"):
+        (tmp_path / name).write_text("1\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "one")
+    (tmp_path / "dvc.lock").write_text("2\n")
+    assert len(facts(tmp_path)["commit"]) == 40
+    (tmp_path / "code.py").write_text("2\n")
+    assert facts(tmp_path)["commit"].endswith(", with uncommitted changes")

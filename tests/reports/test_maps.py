@@ -15,7 +15,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 
-RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
+RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 
 
 def pixel(value):
@@ -27,12 +27,9 @@ def test_fully_polarized_light_shows_its_angle_as_hue(aolp_deg, colour):
     assert tuple(polarization_hsv(pixel(1), pixel(1), pixel(math.radians(aolp_deg)))[0, 0]) == colour
 
 
-def test_unpolarized_light_is_grey_whatever_its_angle():
-    assert tuple(polarization_hsv(pixel(1), pixel(0), pixel(1.0))[0, 0]) == WHITE
-    assert tuple(polarization_hsv(pixel(0.2), pixel(0), pixel(1.0))[0, 0]) == (51, 51, 51)
-
-
 def test_the_papers_map_has_the_angle_as_hue_and_dolp_as_value():
+    assert tuple(polarization_hsv(pixel(1), pixel(0), pixel(1.0))[0, 0]) == (255, 255, 255)
+    assert tuple(polarization_hsv(pixel(0.2), pixel(0), pixel(1.0))[0, 0]) == (51, 51, 51)
     assert tuple(paper_map(pixel(1), pixel(math.radians(60)))[0, 0]) == GREEN
     assert tuple(paper_map(pixel(0.2), pixel(0))[0, 0]) == (51, 0, 0)
     assert tuple(paper_map(pixel(0), pixel(1.0))[0, 0]) == (0, 0, 0)
@@ -53,13 +50,10 @@ def test_full_scale_ignores_pixels_without_events_and_a_hot_pixel():
     assert event_full_scale(torch.zeros(4, 3, 3)) == 1.0
 
 
-def test_dolp_grows_lighter_in_equal_steps():
-    """Rec. 709 luminance of the colours rises everywhere: the map also reads in grey."""
+def test_dolp_grows_lighter_everywhere_and_values_outside_their_range_are_clamped():
+    """Rec. 709 luminance of the colours rises: the map also reads in grey."""
     picture = dolp_image(torch.linspace(0, 1, 64)[None]).astype(float)
     assert (np.diff(picture[0] @ [0.2126, 0.7152, 0.0722]) > 0).all()
-
-
-def test_dolp_and_intensity_outside_their_range_are_clamped():
     values, clamped = torch.tensor([[-0.5, 1.5]]), torch.tensor([[0.0, 1.0]])
     assert (dolp_image(values) == dolp_image(clamped)).all()
     assert intensity_image(values)[0].tolist() == [[0, 0, 0], [255, 255, 255]]

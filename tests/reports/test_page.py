@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from polarnet.reports.artefacts import Run
 from polarnet.reports.page import write_report, write_set_page
 from polarnet.reports.player import Film, Map, player_data
-from polarnet.reports.provenance import Run
 
 RUN = Run(
     "dvc repro",
@@ -47,43 +47,35 @@ def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the
 
 def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(page):
     first = re.search(r"<table.*?</table>", page, re.DOTALL)[0]
-    assert re.findall(r'scope="col">([^<]*)<', first) == [
-        "Method", "MSE ↓", "PSNR, dB ↑", "SSIM ↑", "Correlation ↑", "AoLP error, ° ↓", "Time, ms ↓",
-    ]  # fmt: skip
-    ours = re.search(r'<tr class="m-ours">.*?</tr>', first, re.DOTALL)[0]
-    assert 'class="best"' in ours
+    headings = ["Method", "MSE ↓", "PSNR, dB ↑", "SSIM ↑", "Correlation ↑", "AoLP error, ° ↓", "Time, ms ↓"]
+    assert re.findall(r'scope="col">([^<]*)<', first) == headings
+    assert 'class="best"' in re.search(r'<tr class="m-ours">.*?</tr>', first, re.DOTALL)[0]
+    assert '<th scope="row">E2V: FireNet</th>' in first
 
 
-def test_the_page_says_which_networks_are_behind_its_rows(page):
-    assert "ours: the paper&#39;s network, events to DoLP" in page  # training
-    assert "E2V: FireNet, events to intensity" in page
-    assert "<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper" in page
-    assert '<th scope="row">E2V: FireNet</th>' in page
-    assert "olarnet&#39;s own network" not in page
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("ours: the paper&#39;s network, events to DoLP", "E2V: FireNet, events to intensity"),  # trainings
+        ("<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper",),
+        ("loss:\n  mse: 1.0", "lpips:\n  path:\n", "none: benchmark.lpips is false"),
+        ("&lt;b&gt;Ann&lt;/b&gt;", "broken.jpg", "cannot be read: ends early"),
+    ],
+)
+def test_the_page_shows_networks_parameters_as_in_params_yaml_and_escaped_text_of_files(page, texts):
+    assert all(text in page for text in texts)
+
+
+def test_the_page_names_no_other_network_no_score_that_was_not_computed_and_has_no_warning(page):
+    for absent in ("olarnet&#39;s own network", "<b>Ann</b>", 'class="warning"', "LPIPS ("):
+        assert absent not in page
 
 
 def test_the_papers_figures_are_told_from_those_of_the_run(page):
     published = re.search(r'<aside class="published">.*?</aside>', page, re.DOTALL)[0]
-    assert "Published figures of the paper, not of this run." in published
-    assert "15.56" in published
-    assert "27.48" in published
+    assert all(text in published for text in ("Published figures of the paper, not of this run.", "15.56", "27.48"))
     assert '<tr class="m-ours">' not in published
     assert "15.56" not in page.replace(published, "")
-
-
-def test_without_lpips_the_table_has_no_such_column_and_the_page_no_warning(page):
-    assert 'class="warning"' not in page
-    assert "LPIPS (" not in page
-    assert "none: benchmark.lpips is false" in page
-
-
-def test_parameters_are_listed_as_in_params_yaml_and_text_from_files_is_escaped(page):
-    assert "loss:\n  mse: 1.0" in page
-    assert "lpips:\n  path:\n" in page
-    assert "&lt;b&gt;Ann&lt;/b&gt;" in page
-    assert "<b>Ann</b>" not in page
-    assert "broken.jpg" in page
-    assert "cannot be read: ends early" in page
 
 
 def test_the_player_has_the_scenes_with_events_truth_and_the_methods_that_are_no_constants(page):
@@ -98,12 +90,8 @@ def test_the_player_has_the_scenes_with_events_truth_and_the_methods_that_are_no
     assert player["scenes"][0]["name"].startswith("tree")  # photographs come before generated pictures
 
 
-def test_the_worst_scene_is_named_first_and_leads_to_the_player(page):
-    buttons = re.findall(r'data-scene="([^"]*)"', page)
-    assert sorted(buttons) == ["leaf-00", "tree-00"]
-
-
-def test_a_picture_and_the_papers_files_lie_beside_the_page(folder):
+def test_the_worst_scenes_lead_to_the_player_and_a_picture_and_the_papers_files_lie_beside_the_page(page, folder):
+    assert sorted(re.findall(r'data-scene="([^"]*)"', page)) == ["leaf-00", "tree-00"]
     assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "paper"]
 
 
@@ -144,27 +132,18 @@ def test_the_strips_of_a_page_with_many_scenes_stay_within_their_bytes(monkeypat
     assert {len(scene["ms"]) for scene in player_data(films)["scenes"]} <= {4, 5, 6}
 
 
-@pytest.fixture(scope="module")
-def set_page(paths, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("set") / "results"
+def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(paths, tmp_path):
+    folder = tmp_path / "results"
     shutil.copytree(paths.simulated, folder)
     notes = ["e2vid was left out: run `dvc repro`."]
-    path = write_set_page(folder, "my <holidays>", "polarnet benchmark --scenes x", notes)
+    set_page = write_set_page(folder, "my <holidays>", "polarnet benchmark --scenes x", notes).read_text()
     assert (folder / "comparison.png").exists()
-    return path.read_text()
-
-
-def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(set_page):
     for text in (
-        "my &lt;holidays&gt;",
-        "15.56",
-        "oracle mean",
+        "my &lt;holidays&gt;", "15.56", "oracle mean", "<dt>E2V: FireNet</dt>",
         "<dt>ours: the paper&#39;s network</dt><dd>best.safetensors (sha256 5ca1ab1e5ca1ab1e)</dd>",
-        "Published figures of the paper, not of this run.",
+        "Published figures of the paper, not of this run.", "e2vid was left out: run <code>dvc repro</code>.",
         "Sequences of 24x36 pixels (height x width), 0.2 s at 30 frames a second.",
-        "<dt>E2V: FireNet</dt>",
-        "e2vid was left out: run <code>dvc repro</code>.",
-    ):
+    ):  # fmt: skip
         assert text in set_page
     assert "LPIPS (" not in set_page
     assert "`" not in set_page.split("<main>")[1].split("<script")[0]

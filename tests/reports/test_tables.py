@@ -1,13 +1,6 @@
 import math
 
-from polarnet.reports.tables import (
-    COLUMNS,
-    ERROR_PARTS,
-    PAPER_TABLE_2,
-    as_markdown,
-    paper_table,
-    score_table,
-)
+from polarnet.reports.tables import COLUMNS, ERROR_PARTS, PAPER_TABLE_2, as_markdown, paper_table, score_table
 
 SCORES = {
     "ours": {"mse": 0.02, "psnr": 17.0, "ssim": 0.4, "lpips": None, "corr": 0.6, "ms_per_window": 19.04},
@@ -26,9 +19,12 @@ def test_methods_keep_one_order_and_one_without_a_name_follows_under_its_own_key
     assert [r.label for r in table.rows] == ["zeros", "e2vid_official"]
 
 
-def test_values_that_read_the_same_are_bold_together():
+def test_values_that_read_the_same_are_bold_together_and_the_fastest_method_is_not_because_speed_is_no_score():
     table = score_table({"cf": {"psnr": 12.001}, "ours": {"psnr": 12.004}})
     assert [r.cells[0].best for r in table.rows] == [True, True]
+    table = score_table(SCORES)
+    assert table.headings[-1] == "ms / window ↓"
+    assert not any(r.cells[-1].best for r in table.rows)
 
 
 def test_a_row_of_another_camera_is_never_bold_and_a_note_says_why():
@@ -40,12 +36,6 @@ def test_a_row_of_another_camera_is_never_bold_and_a_note_says_why():
     assert score_table({"ours": {"mse": 0.02}}).notes == ()
 
 
-def test_the_fastest_method_is_not_bold_because_speed_is_no_score():
-    table = score_table(SCORES)
-    assert table.headings[-1] == "ms / window ↓"
-    assert not any(r.cells[-1].best for r in table.rows)
-
-
 def test_lpips_names_its_backbone_in_heading_and_caption():
     scores = {method: row | {"lpips": 0.25, "lpips_backbone": "alex"} for method, row in SCORES.items()}
     table = score_table(scores)
@@ -54,10 +44,11 @@ def test_lpips_names_its_backbone_in_heading_and_caption():
     assert score_table(scores, ERROR_PARTS).notes == ()
 
 
-def test_intervals_stand_below_their_values_with_the_same_decimals():
+def test_intervals_stand_below_their_values_with_the_same_decimals_and_what_rounds_to_zero_has_no_sign():
     table = score_table({"cf": {"psnr": 7.0}, "ours": {"psnr": 17.0, "psnr_ci": [16.125, 18.0]}})
     assert "**17.00**<br><sub>16.12 to 18.00</sub>" in as_markdown(table)
     assert row(table, "cf").cells[0].interval == ""
+    assert [COLUMNS["skill"].printed(value) for value in (-0.0001, -0.0006)] == ["0.000", "-0.001"]
 
 
 def test_the_papers_figures_agree_with_each_other():
@@ -66,8 +57,3 @@ def test_the_papers_figures_agree_with_each_other():
         assert all(cell.best for cell in row(paper_table(experiment), "paper").cells)
         assert set(methods) == {"cf", "e2v", "paper"}
         assert all(scores["psnr"] >= -10 * math.log10(scores["mse"]) - 0.01 for scores in methods.values())
-
-
-def test_what_rounds_to_zero_has_no_sign():
-    assert COLUMNS["skill"].printed(-0.0001) == "0.000"
-    assert COLUMNS["skill"].printed(-0.0006) == "-0.001"

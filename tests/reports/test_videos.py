@@ -9,7 +9,7 @@ import av
 import numpy as np
 import pytest
 
-from polarnet.reports.videos import VideoWriter
+from polarnet.reports.preview import VideoWriter
 
 
 def grey(level, height=64, width=96):
@@ -47,7 +47,7 @@ def test_after_a_kill_the_complete_fragments_play(tmp_path):
     script = """
 import sys, time, numpy as np
 from pathlib import Path
-from polarnet.reports.videos import VideoWriter
+from polarnet.reports.preview import VideoWriter
 video = VideoWriter(Path(sys.argv[1]), 10.0)
 for level in range(100):
     video.add(np.full((64, 96, 3), level, np.uint8))

@@ -65,11 +65,9 @@ def test_what_is_no_array_of_real_numbers_is_named(values, got):
 def test_a_shape_that_does_not_fit_is_told_with_the_order_that_would(shape, axes, message):
     with pytest.raises(ValueError, match=message):
         check_shape("light", np.zeros(shape), axes)
-
-
-def test_tensors_are_told_to_permute():
-    with pytest.raises(ValueError, match=r"use permute\(2, 0, 1\)$"):
-        check_shape("light", torch.zeros(4, 5, 3), "3 height width")
+    if "transpose" in message:
+        with pytest.raises(ValueError, match=message.replace("transpose", "permute")):
+            check_shape("light", torch.zeros(shape), axes)
 
 
 def test_values_that_are_not_finite_are_counted_and_located():
@@ -109,9 +107,6 @@ def test_floats_of_any_precision_come_as_float32_or_float64(dtype):
     values = fractions("light", torch.tensor([0.25, 0.5], dtype=dtype), "n")
     assert values.tolist() == [0.25, 0.5]
     assert values.dtype in (torch.float32, torch.float64)
-
-
-def test_a_gradient_is_not_carried_on():
     assert not floats("light", torch.ones(2, requires_grad=True), "n").requires_grad
 
 
@@ -119,12 +114,9 @@ def test_a_gradient_is_not_carried_on():
 def test_whole_numbers_of_any_type_are_int64(dtype):
     numbers = whole_numbers("t", np.array([1, 2], dtype))
     assert (numbers.dtype, numbers.tolist()) == (torch.int64, [1, 2])
-
-
-@pytest.mark.parametrize("values", [np.array([1.5]), np.array([True])])
-def test_floats_and_truth_values_are_no_whole_numbers(values):
-    with pytest.raises(ValueError, match="t: expected whole numbers, got torch"):
-        whole_numbers("t", values)
+    for values in (np.array([1.5]), np.array([True])):
+        with pytest.raises(ValueError, match="t: expected whole numbers, got torch"):
+            whole_numbers("t", values)
 
 
 @pytest.mark.parametrize("values", [np.ones((2, 3)), np.ones((3, 2), bool)])

@@ -47,10 +47,7 @@ def fail_on_two(value: int) -> int:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_the_order_of_the_items(workers):
     assert pmap(square, list(range(7)), workers=workers, label="squares") == [0, 1, 4, 9, 16, 25, 36]
-
-
-def test_no_items_no_work():
-    assert pmap(square, [], workers=2, label="squares") == []
+    assert pmap(square, [], workers=workers, label="squares") == []
 
 
 @pytest.mark.usefixtures("forked_workers")

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from polarnet.terminal.environment import let_threads_sleep
-
 IMPORT_EVERYTHING = """
 import importlib, json, os, pkgutil, sys
 import torch, numba, cv2, zarr, hydra, matplotlib.figure, OpenImageIO, scipy.optimize  # they may set what they like
@@ -63,9 +61,6 @@ def test_a_program_decides_how_threads_wait_before_torch_is_there(package, proje
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, cwd=project_root, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "passive False"
-
-
-def test_a_policy_that_the_user_has_set_stays(monkeypatch):
-    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    let_threads_sleep()
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    environment["OMP_WAIT_POLICY"] = "active"  # that of the user stays
+    done = subprocess.run(command, cwd=project_root, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "active False"

@@ -9,7 +9,6 @@ import torch
 from polarnet.runtime import machine as runtime
 from polarnet.runtime.machine import (
     RuntimeConfig,
-    bf16_units,
     device_of,
     generator_for,
     keep_freed_memory,
@@ -24,9 +23,6 @@ def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
     assert seed_for(1, "coffee", "motion") == seed_for(1, "coffee", "motion")
     assert len({seed_for(1, "coffee", "motion"), seed_for(2, "coffee", "motion"), seed_for(1, "cat", "motion"),
                 seed_for(1, "coffee", "events")}) == 4  # fmt: skip
-
-
-def test_parts_do_not_run_into_each_other():
     assert seed_for(1, "1a", "b") != seed_for(11, "a", "b")
 
 
@@ -40,20 +36,11 @@ def test_a_missing_gpu_is_refused_with_the_way_out():
         device_of(dataclasses.replace(RUNTIME, device="cuda:99"))
 
 
-def test_zero_workers_are_refused():
-    with pytest.raises(ValueError, match="workers: expected > 0, got 0"):
-        dataclasses.replace(RUNTIME, workers=0)
-
-
 @pytest.mark.parametrize(("units", "precision"), [([], "fp32"), (["AMX"], "bf16")])
 def test_automatic_precision_is_bf16_only_where_the_device_has_units_for_it(monkeypatch, units, precision):
     monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
     cpu = torch.device("cpu")
     assert [precision_on(cpu, asked) for asked in ("auto", "fp32", "bf16")] == [precision, "fp32", "bf16"]
-
-
-def test_a_device_that_is_neither_a_processor_nor_cuda_has_no_bf16_units_that_we_know_of():
-    assert bf16_units(torch.device("meta")) == []
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left as they are")

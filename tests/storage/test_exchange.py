@@ -81,7 +81,7 @@ def test_evt3_refuses_a_sensor_with_more_columns_than_its_words_count(make_event
 
 def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[hdf5\]' in the clone"):
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[recordings\]' in the clone"):
         write_hdf5(tmp_path / "e.h5", make_events([], 1, 1), 1000)
 
 

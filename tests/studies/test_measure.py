@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from polarnet.reports.provenance import git
+from polarnet.reports.artefacts import git
 from studies import study
 from studies.measure import STUDIES, Study, command_of, finished, measure_ablation, measure_pipeline, timed_make
 from studies.study import arguments_of, command_line, uncommitted, write_section

@@ -1,7 +1,5 @@
 import math
-from types import SimpleNamespace
 
-import psutil
 import pytest
 import torch
 
@@ -93,8 +91,8 @@ def test_a_dataset_in_memory_is_read_once_by_this_process_or_by_workers(stores, 
 def test_processes_of_a_machine_share_its_memory(stores, monkeypatch):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
     needed = 2 * sum(tensor.nbytes for tensor in packed(dataset[0], True)[1:] if tensor is not None)
-    free = SimpleNamespace(available=1.5 * needed / MEMORY_SHARE)  # enough for one process
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
+    free = int(1.5 * needed / MEMORY_SHARE)  # enough for one process
+    monkeypatch.setattr("polarnet.training.engine.sequences.memory", lambda: (free, free))
     assert loaded_if_it_fits(dataset, intensity=True, workers=1) is not None
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
     assert loaded_if_it_fits(dataset, intensity=True, workers=1) is None

@@ -62,7 +62,7 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        raise RuntimeError(f"{path.name}: this format needs rosbags: {installation('rosbag')}") from None
+        raise RuntimeError(f"{path.name}: this format needs rosbags: {installation('recordings')}") from None
     store = get_typestore(Stores.LATEST)
     for package in PACKAGES:
         for name, text in DEFINITIONS.items():

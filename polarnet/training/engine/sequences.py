@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import psutil
 import torch
 from jaxtyping import Bool, Float, Int8
 from pydantic import Field, PositiveInt
@@ -18,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from polarnet.events.representations import Encode
 from polarnet.events.streaming import encode_windows
-from polarnet.runtime.machine import generator_for, memory_handed_back, processes_here
+from polarnet.runtime.machine import generator_for, memory, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
 from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
@@ -167,7 +166,7 @@ def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> 
     `workers` processes read and encode them; 0 or 1: this process. `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
-    if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * psutil.virtual_memory().available:
+    if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * memory()[0]:
         return None
     workers = workers if workers > 1 else 0
     packing = functools.partial(packed, intensity=intensity)

@@ -48,5 +48,5 @@ def test_a_damaged_bag_is_refused(rosbags, tmp_path):
 def test_without_rosbags_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     (tmp_path / "e.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
-    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[rosbag\]' in the clone"):
+    with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[recordings\]' in the clone"):
         read_recording(tmp_path / "e.bag")
