@@ -287,11 +287,13 @@ def main() -> None:
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
     tables = tables_of(conditions, means, train_mean, arguments.weights, common)
+    figures = headlines(tables, next(iter(arguments.weights)))
+    print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
     (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
-        write_section("robustness", arguments.split, section, record)
+        write_section("robustness", arguments.split, section, record, figures if arguments.split == "test" else None)
 
 
 if __name__ == "__main__":

@@ -212,7 +212,8 @@ def _hot_events(
     order = np.argsort(t, kind="stable")
     p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
     y, x = np.ascontiguousarray(yx[order].T)
-    return Events(*map(torch.from_numpy, (t[order], x, y, p)), height, width)
+    columns = (torch.from_numpy(column) for column in (t[order], x, y, p))
+    return Events(*columns, height=height, width=width)
 
 
 def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:

@@ -88,7 +88,7 @@ class Times(NamedTuple):
     source: str
     of: Callable[[int, ClipFrame], float]
     """Time in microseconds of a frame, by its number; it may start at any time."""
-    count: int | None = None
+    number: int | None = None
     """Number of times; None: as many as frames."""
 
 
@@ -168,7 +168,7 @@ def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[
     """
     number, before, first = -1, -1, 0.0
     for number, frame in enumerate(clip.frames()):
-        if number == times.count:
+        if number == times.number:
             raise ValueError(f"{times.source}: expected a time for each frame, got {number} times and more frames")
         time_us = times.of(number, frame)
         first = time_us if number == 0 else first
@@ -181,5 +181,5 @@ def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[
         before = t_us
         saturation.append(frame.saturated)
         yield StokesFrame(t_us, _polarized(clip, frame).stokes)
-    if times.count is not None and number + 1 < times.count:
-        raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {times.count}")
+    if times.number is not None and number + 1 < times.count:
+        raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {times.number}")

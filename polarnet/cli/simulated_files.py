@@ -66,7 +66,10 @@ class EventSpool:
             values = np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype)  # no map is empty
             return torch.from_numpy(values)
 
-        return [Events(*(column(k, name) for name in COLUMNS), *size) for k, size in enumerate(self._sizes)]
+        return [
+            Events(*(column(k, name) for name in COLUMNS), height=height, width=width)
+            for k, (height, width) in enumerate(self._sizes)
+        ]
 
 
 def write_simulation(

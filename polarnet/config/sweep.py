@@ -96,7 +96,7 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for overrides, group in groups.items():
         finished, failed = ([point for point in group if bool(point["failure"]) == bad] for bad in (False, True))
-        row = {"jobs": [point["job"] for point in group], "overrides": list(overrides)}
+        row: dict[str, Any] = {"jobs": [point["job"] for point in group], "overrides": list(overrides)}
         row |= {"seeds": [one["seed"] for one in finished], "failed_seeds": [one["seed"] for one in failed]}
         for split, name in SCORES:
             values = [point[split].get(name) for point in finished]
