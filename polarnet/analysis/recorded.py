@@ -92,14 +92,8 @@ def read_recorded(
             f"{path.name}: expected events and frames on one clock, got events from {first_us} to {last_us} us and "
             f"frames from {truth.t_us[0]} to {truth.t_us[-1]} us; bring them onto one clock"
         )
-    keep = torch.from_numpy(during)
     truth = Truth(
-        truth.t_us[during],
-        truth.intensity[keep],
-        truth.dolp[keep],
-        truth.aolp[keep],
-        truth.valid[keep],
-        truth.light[during],
+        *(values[torch.from_numpy(during)] if torch.is_tensor(values) else values[during] for values in truth)
     )
     notes = [f"{name}: {note}" for note in clock_notes(truth.t_us, frame_lag(events, truth))]
     start_us, stop_us = int(truth.t_us[0]), int(truth.t_us[-1])
