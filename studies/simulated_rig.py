@@ -212,8 +212,8 @@ def _hot_events(
     order = np.argsort(t, kind="stable")
     p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
     y, x = np.ascontiguousarray(yx[order].T)
-    columns = (torch.from_numpy(column) for column in (t[order], x, y, p))
-    return Events(*columns, height=height, width=width)
+    columns = [torch.from_numpy(column) for column in (t[order], x, y, p)]
+    return Events(columns[0], columns[1], columns[2], columns[3], height, width)
 
 
 def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:

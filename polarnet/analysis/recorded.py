@@ -93,14 +93,7 @@ def read_recorded(
             f"frames from {truth.t_us[0]} to {truth.t_us[-1]} us; bring them onto one clock"
         )
     keep = torch.from_numpy(during)
-    truth = Truth(
-        truth.t_us[during],
-        truth.intensity[keep],
-        truth.dolp[keep],
-        truth.aolp[keep],
-        truth.valid[keep],
-        truth.light[during],
-    )
+    truth = Truth._make(values[keep] if torch.is_tensor(values) else values[during] for values in truth)
     notes = [f"{name}: {note}" for note in clock_notes(truth.t_us, frame_lag(events, truth))]
     start_us, stop_us = int(truth.t_us[0]), int(truth.t_us[-1])
     cleaner = Cleaner(cleaning, mosaic)

@@ -181,5 +181,5 @@ def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[
         before = t_us
         saturation.append(frame.saturated)
         yield StokesFrame(t_us, _polarized(clip, frame).stokes)
-    if times.number is not None and number + 1 < times.count:
+    if times.number is not None and number + 1 < times.number:
         raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {times.number}")

@@ -67,7 +67,7 @@ class EventSpool:
             return torch.from_numpy(values)
 
         return [
-            Events(*(column(k, name) for name in COLUMNS), height=height, width=width)
+            Events(column(k, "t"), column(k, "x"), column(k, "y"), column(k, "p"), height, width)
             for k, (height, width) in enumerate(self._sizes)
         ]
 

@@ -9,7 +9,7 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.simulation.camera import Camera, channel_size
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.scene import scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
@@ -28,13 +28,39 @@ def emulate_scenes(
     """
     source = SceneStore.open(scenes)
     size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
-    origin = origin_of(source, camera, seed)
-    store = EventStore.create(events, source.sequences, *size, origin, source.sequences_per_part)
-    task = functools.partial(_emulate_part, scenes=source, events=store, camera=camera, seed=seed, threads=threads)
+    store = EventStore.create(
+        events, source.sequences, *size, origin_of(source, camera, seed), source.sequences_per_part
+    )
+    emulated = functools.partial(emulate_sequence, source, camera=camera, seed=seed, threads=threads)
+    return fill_store(store, source, emulated, camera, seed, mapper)
+
+
+def fill_store(
+    store: EventStore,
+    scenes: SceneStore,
+    emulated: Callable[[str], list[Events]],
+    camera: Camera,
+    seed: int,
+    mapper: Mapper,
+) -> int:
+    """Write what `emulated` returns for each sequence that is missing in a store; returns the number of sequences."""
+    task = functools.partial(_fill_part, scenes=scenes, events=store, emulated=emulated, camera=camera, seed=seed)
     for _ in mapper(task, store.missing_parts()):
         pass
     store.finish()
     return len(store.sequences)
+
+
+def _fill_part(
+    part: str,
+    scenes: SceneStore,
+    events: EventStore,
+    emulated: Callable[[str], list[Events]],
+    camera: Camera,
+    seed: int,
+) -> None:
+    for sequence in events.parts[part]:
+        events.write(sequence, emulated(sequence), scenes.duration_us(sequence), camera.draws(seed, sequence))
 
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
@@ -47,17 +73,16 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 
     Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
     """
-    stored, size = scenes.read(sequence), (scenes.sensor_height, scenes.sensor_width)
-    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-    trajectory = Trajectory.from_vector(scenes.trajectory(sequence))
-    duration_us = scenes.duration_us(sequence)
+    scene, trajectory, duration_us = motion_over(scenes, sequence)
+    size = scenes.sensor_height, scenes.sensor_width
     return emulate_motion(camera.drawn(seed, sequence), scene, trajectory, duration_us, size, threads)
 
 
-def _emulate_part(part: str, scenes: SceneStore, events: EventStore, camera: Camera, seed: int, threads: int) -> None:
-    for sequence in events.parts[part]:
-        channels = emulate_sequence(scenes, sequence, camera, seed, threads)
-        events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence))
+def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:
+    """The scene of a stored sequence, the motion over it, and its duration in microseconds."""
+    stored = scenes.read(sequence)
+    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
 
 
 class EmulatedEvents:

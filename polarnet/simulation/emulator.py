@@ -16,8 +16,8 @@ from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range,
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import Columns, empty_columns, trimmed
-from polarnet.simulation.pixels.defects import DefectsConfig, defects_of, with_defects
+from polarnet.simulation.pixels.columns import Columns, empty_columns
+from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.ranges import RandomisedConfig
 
@@ -36,6 +36,7 @@ class Steps(NamedTuple):
     first_number: int  # steps that the channel has taken before; random draws are numbered by it
     key: np.uint64  # seed of all noise of the sensor
     channel: int  # each channel has its own mismatch and noise
+    defects: Defects
 
 
 class PixelModel(Protocol):
@@ -178,24 +179,21 @@ def emulate_lights(
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
     empty = [empty_columns(room) for _ in numbers]
 
-    def emulate_channel(i: int) -> tuple[Columns, Any]:
-        steps = Steps(physics, height, width, times, first_frame, first_number, seed, numbers[i])
+    def emulate_channel(i: int) -> tuple[list[Tensor], Any]:
+        defects = defects_of(config, height * width, seed, numbers[i], round_up=model is v2e)
+        steps = Steps(physics, height, width, times, first_frame, first_number, seed, numbers[i], defects)
         if state is None:
             pixels = model.initial(height, width, physics, seed, numbers[i])
             model.start(lights[i], pixels, steps)
         else:
             pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
-        columns = trimmed(*model.advance(lights[i], pixels, steps, empty[i]))
-        if defects := defects_of(config, height * width, seed, numbers[i]):
-            # v2e stamps an event after the start of its step and up to its end, the others before the end
-            columns = with_defects(columns, defects, width, float(times[0]), float(times[-1]), model is v2e)
-        return columns, pixels
+        columns, count = model.advance(lights[i], pixels, steps, empty[i])
+        return [torch.from_numpy(column[:count]) for column in columns], pixels
 
     with ThreadPoolExecutor(threads) as pool:
         channel_map = pool.map if threads > 1 else map
         columns, pixels = zip(*channel_map(emulate_channel, range(len(numbers))), strict=True)
-    tensors = ([torch.from_numpy(column) for column in channel] for channel in columns)
-    events = [Events(t, x, y, p, height, width) for t, x, y, p in tensors]
+    events = [Events(t, x, y, p, height, width) for t, x, y, p in columns]
     steps_taken = first_number + len(times) - 1
     return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
 

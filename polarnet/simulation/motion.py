@@ -3,9 +3,8 @@
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple, no_type_check
+from typing import Annotated, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
@@ -13,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from polarnet.runtime.sections import section
+from polarnet.simulation.compilation import compiled, inlined
 from polarnet.simulation.scene import PolarizationScene
 
 HARMONICS = 3  # number of sines in the motion along each axis
@@ -302,11 +302,8 @@ def render_poses(scene: PolarizationScene, pose: Pose, height: int, width: int) 
     return frames
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def sensor_to_scene(
-    x: float, y: float, angle: float, zoom: float, height: int, width: int
-) -> tuple[float, float, float, float]:
+@compiled
+def sensor_to_scene(x, y, angle, zoom, height, width):
     """(left, top, along, across) of a sensor whose centre, ((height - 1) / 2, (width - 1) / 2), looks at (x, y).
 
     Pixel (row, column) looks at (left + column along - row across, top + column across + row along) of the scene.
@@ -318,9 +315,8 @@ def sensor_to_scene(
     return left, top, along, across
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def bilinear(image: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
+@inlined
+def _bilinear(image, x, y):
     """Value of an image between the four pixels around (x, y); exact at integers, clamped at the border."""
     column = min(max(int(x), 0), image.shape[1] - 2)
     row = min(max(int(y), 0), image.shape[0] - 2)
@@ -331,9 +327,8 @@ def bilinear(image: Float32[np.ndarray, "h w"], x: float, y: float) -> float:
     return up * upper + down * lower
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def _render(stokes, x, y, angle, zoom, frames) -> None:
+@compiled
+def _render(stokes, x, y, angle, zoom, frames):
     height, width = frames.shape[2:]
     for k in range(len(x)):
         left, top, along, across = sensor_to_scene(x[k], y[k], angle[k], zoom[k], height, width)
@@ -342,7 +337,7 @@ def _render(stokes, x, y, angle, zoom, frames) -> None:
             for column in range(width):
                 at_x = left + column * along - row * across
                 at_y = top + column * across + row * along
-                s1, s2 = bilinear(stokes[1], at_x, at_y), bilinear(stokes[2], at_x, at_y)
-                frames[k, 0, row, column] = bilinear(stokes[0], at_x, at_y)
+                s1, s2 = _bilinear(stokes[1], at_x, at_y), _bilinear(stokes[2], at_x, at_y)
+                frames[k, 0, row, column] = _bilinear(stokes[0], at_x, at_y)
                 frames[k, 1, row, column] = s1 * cos + s2 * sin
                 frames[k, 2, row, column] = s2 * cos - s1 * sin

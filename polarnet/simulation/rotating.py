@@ -2,10 +2,9 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -15,11 +14,11 @@ from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera, Grid, grid, read_out
-from polarnet.simulation.dataset import origin_of
+from polarnet.simulation.dataset import Mapper, fill_store, motion_over, origin_of
 from polarnet.simulation.emulator import Channels, emulate_frames
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, checked_pose, render_times_us, rendered_chunks
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import NUM_CHANNELS, analyzer
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
@@ -74,37 +73,24 @@ def emulate_rotating(
 
 
 def emulate_rotating_scenes(
-    scenes: Path,
-    events: Path,
-    rotating: RotatingConfig,
-    camera: Camera,
-    seed: int,
-    mapper: Callable[..., Iterable[Any]],
+    scenes: Path, events: Path, rotating: RotatingConfig, camera: Camera, seed: int, mapper: Mapper
 ) -> int:
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
     Events are in the store's first channel; the other three are empty. `mapper` is as in `dataset.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
+    pixels = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
-    height, width, _ = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
-    names = source.of_split("test")
-    store = EventStore.create(events, names, height, width, attributes, source.sequences_per_part)
-    task = functools.partial(_emulate_part, scenes=source, events=store, rotating=rotating, camera=camera, seed=seed)
-    for _ in mapper(task, store.missing_parts()):
-        pass
-    store.finish()
-    return len(names)
+    size, per_part = (pixels.height, pixels.width), source.sequences_per_part
+    store = EventStore.create(events, source.of_split("test"), *size, attributes, per_part)
+    emulated = functools.partial(_emulate_stored, source, rotating, camera, seed, pixels)
+    return fill_store(store, source, emulated, camera, seed, mapper)
 
 
-def _emulate_part(
-    part: str, scenes: SceneStore, events: EventStore, rotating: RotatingConfig, camera: Camera, seed: int
-) -> None:
-    pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
-    others = [Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)
-    for sequence in events.parts[part]:
-        stored, drawn = scenes.read(sequence), camera.drawn(seed, sequence, "rotating")
-        scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-        trajectory, duration_us = Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
-        output = emulate_rotating(rotating, drawn, scene, trajectory, duration_us, pixels)
-        events.write(sequence, [output, *others], duration_us, camera.draws(seed, sequence))
+def _emulate_stored(
+    scenes: SceneStore, rotating: RotatingConfig, camera: Camera, seed: int, pixels: Grid, sequence: str
+) -> list[Events]:
+    drawn = camera.drawn(seed, sequence, "rotating")
+    output = emulate_rotating(rotating, drawn, *motion_over(scenes, sequence), pixels)
+    return [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)]

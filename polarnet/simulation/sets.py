@@ -10,9 +10,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import Field, PositiveFloat
+from typing import Any
 
 from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
@@ -39,16 +37,12 @@ class SetsConfig:
 
     measured_root: str
     """Folder of the measurements for the test set `measured`, searched recursively."""
-    rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
-    """This field and the next four set the motion of `complex_motion`."""
-    zoom_max: Annotated[float, Field(ge=1, le=16)]
-    speed_min_px_s: PositiveFloat
-    speed_max_px_s: PositiveFloat
-    acceleration_max_px_s2: PositiveFloat
-
-    def __post_init__(self):
-        if self.speed_max_px_s < self.speed_min_px_s:
-            raise ValueError(f"speed_max_px_s: expected >= speed_min_px_s {self.speed_min_px_s}, got {self}")
+    rotation_max_deg: float
+    """This field and the next four replace those of `synthesize` in the motion of `complex_motion`."""
+    zoom_max: float
+    speed_min_px_s: float
+    speed_max_px_s: float
+    acceleration_max_px_s2: float
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import json
+import operator
 import os
 import shutil
 import sys
@@ -159,11 +160,9 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         ("terminal/progress.py", set()),
         ("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
         thorough("networks/polarnet/stokes_unet.py", {"train", "report"} | ROWS),
-        thorough("networks/paper/dolp_unet.py", {"report"} | ROWS),
         thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
         thorough("networks/registry.py", {"report"} | ROWS),
         thorough("training/dolp.py", {"train"}),
-        thorough("clips/video.py", set()),
         thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
         thorough("reports/charts.py", {"calibrate", "report"}),
@@ -178,13 +177,7 @@ def test_a_changed_file_runs_what_it_can_change(project, file, stages):
 
 def put(section: str, **values: Any) -> Callable[[Any], None]:
     """An edit of some keys of a section."""
-
-    def change(params: Any) -> None:
-        for part in section.split("."):
-            params = params[part]
-        params.update(values)
-
-    return change
+    return lambda params: functools.reduce(operator.getitem, section.split("."), params).update(values)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +185,6 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
     [
         (put("networks.paper", swin_depth=3), set()),
         (put("methods.sharpening", unsharp_amount=0.5), {"benchmark@cf+gain", "benchmark@highpass+gain", "report"}),
-        thorough(put("baselines.e2p", epochs=2), {"weights", "report"}),
         thorough(put("baselines.e2v", epochs=2), {"weights", "train_baseline@e2v", "report"}),
         thorough(put("methods.cf", cutoff_hz=1.0), {"benchmark@cf", "benchmark@cf+gain", "benchmark@highpass+gain",
                                                     "report"}),

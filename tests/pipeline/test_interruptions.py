@@ -5,7 +5,6 @@ Stages start in children of a process that has imported the stage once, so that 
 
 import contextlib
 import functools
-import hashlib
 import os
 import shutil
 import signal
@@ -19,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from part_fixtures import files_of
 from preloaded import FORKSERVER
 from skimage import data
 
@@ -28,14 +28,6 @@ PARTS = 10
 KILLS = 10
 PATIENCE_S = 120.0
 SEED = 20
-
-
-class Running(NamedTuple):
-    """A stage in a process group of its own."""
-
-    pid: int
-    wait: Callable[[], int]
-    """Blocks until it has ended; its exit status, negative for a signal."""
 
 
 @pytest.fixture(scope="module")
@@ -82,24 +74,23 @@ def run_stage(arguments: list[str]) -> None:
     stages.emulate.main()
 
 
-def start(arguments: list[str]) -> Running:
+def start(arguments: list[str]):
+    """A stage in a process group of its own."""
     process = FORKSERVER.Process(target=run_stage, args=([*arguments, "runtime.threads=1"],))
     process.start()
-    pid = process.pid
-    assert pid is not None
-    until(lambda: os.getpgid(pid) == pid)  # else the signal would find no such group
-
-    def wait() -> int:
-        process.join(PATIENCE_S)
-        assert process.exitcode is not None, "the stage hangs"
-        return process.exitcode
-
-    return Running(pid, wait)
+    until(lambda: os.getpgid(process.pid) == process.pid)  # else the signal would find no such group
+    return process
 
 
-def digest(folder: Path) -> dict[str, str]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "origin.json")
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+def ended(process) -> int:
+    """Exit status of a stage once it has ended, negative for a signal."""
+    process.join(PATIENCE_S)
+    assert process.exitcode is not None, "the stage hangs"
+    return process.exitcode
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {name: content for name, content in files_of(folder).items() if Path(name).name != "origin.json"}
 
 
 def finished(unfinished: Path) -> set[str]:
@@ -123,7 +114,7 @@ def until(true: Callable[[], bool], still_worth_it: Callable[[], bool] = lambda:
 class Undisturbed(NamedTuple):
     """Output and pace of an uninterrupted run."""
 
-    digests: dict[str, str]
+    content: dict[str, bytes]
     seconds_to_first: float
     seconds_each: float
 
@@ -131,13 +122,13 @@ class Undisturbed(NamedTuple):
 @pytest.fixture(scope="module")
 def undisturbed(folder: Path) -> Undisturbed:
     events = folder.parent / "undisturbed" / "events.zarr"
-    start(overrides(folder, events.with_name("warm.zarr"))).wait()  # compiles what is not compiled yet
+    ended(start(overrides(folder, events.with_name("warm.zarr"))))  # compiles what is not compiled yet
     begin = time.monotonic()
     running = start(overrides(folder, events))
     until(lambda: bool(finished(events.with_name("events.zarr.tmp"))))
     first = time.monotonic()
-    assert running.wait() == 0
-    return Undisturbed(digest(events), first - begin, (time.monotonic() - first) / (PARTS - 1))
+    assert ended(running) == 0
+    return Undisturbed(content(events), first - begin, (time.monotonic() - first) / (PARTS - 1))
 
 
 @pytest.mark.thorough
@@ -157,7 +148,7 @@ def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(folder
             time.sleep(generator.uniform(0, undisturbed.seconds_to_first))
         with contextlib.suppress(ProcessLookupError):  # where it has ended already
             os.killpg(running.pid, signal.SIGKILL)
-        status = running.wait()
+        status = ended(running)
         if events.exists():  # it was quicker than its death: begin anew
             assert identities(events).items() >= known.items()
             shutil.rmtree(events)
@@ -168,9 +159,9 @@ def test_ten_deaths_at_random_moments_change_no_byte_and_no_finished_part(folder
         known = identities(unfinished)
         deaths.append(len(finished(unfinished)))
     assert max(deaths) > 0
-    assert start(overrides(folder, events)).wait() == 0
+    assert ended(start(overrides(folder, events))) == 0
     assert identities(events).items() >= known.items()
-    assert digest(events) == undisturbed.digests
+    assert content(events) == undisturbed.content
     assert not unfinished.exists()
 
 
@@ -200,12 +191,12 @@ def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_on
     folder, undisturbed, cluster, tmp_path
 ):
     over_dask(folder, tmp_path / "one.zarr", cluster)
-    assert digest(tmp_path / "one.zarr") == undisturbed.digests
+    assert content(tmp_path / "one.zarr") == undisturbed.content
 
     cluster.scale(3)
     cluster.wait_for_workers(3)
     over_dask(folder, tmp_path / "three.zarr", cluster)
-    assert digest(tmp_path / "three.zarr") == undisturbed.digests
+    assert content(tmp_path / "three.zarr") == undisturbed.content
 
     events, unfinished = tmp_path / "killed.zarr", tmp_path / "killed.zarr.tmp"
     done_at_death: list[int] = []
@@ -223,4 +214,4 @@ def test_one_and_three_dask_workers_and_one_killed_half_way_give_the_bytes_of_on
     over_dask(folder, events, cluster)
     killer.join()
     assert 2 <= done_at_death[0] < PARTS
-    assert digest(events) == undisturbed.digests
+    assert content(events) == undisturbed.content

@@ -1,7 +1,6 @@
 """The stages themselves, at toy size, with the command lines that DVC calls (`trial` starts two as DVC does)."""
 
 import dataclasses
-import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import preloaded
 import pytest
 import torch
+from part_fixtures import files_of, flip
 
 from polarnet.benchmark import cost
 from polarnet.config.origins import pipeline
@@ -62,11 +62,6 @@ def save_time() -> None:
     preloaded.fork_workers_too()
 
 
-def bytes_of(folder: Path) -> dict[str, str]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
 @pytest.fixture(scope="module")
 def data(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The data folder after the whole pipeline ran with one worker."""
@@ -98,15 +93,6 @@ def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_b
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 
-def test_a_baseline_that_no_row_uses_is_not_trained(project_root, tmp_path):
-    arguments = [*TINY, "benchmark.methods=[zeros,e2v,ours]", "baseline=e2p", f"paths.data={tmp_path / 'data'}",
-                 f"hydra.run.dir={tmp_path / 'log'}"]  # fmt: skip
-    done = preloaded.run_stage(project_root, "train", arguments)
-    assert done.returncode != 0
-    assert "no row of benchmark.methods uses the weights of baselines.e2p" in done.stdout
-    assert not (tmp_path / "data").exists()
-
-
 @pytest.mark.thorough
 def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root, data, tmp_path):
     shutil.copytree(data / "benchmark", tmp_path / "benchmark")
@@ -123,10 +109,7 @@ def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root
 @pytest.mark.thorough
 def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_root, data, tmp_path):
     shutil.copytree(data / "scenes.zarr", tmp_path / "scenes.zarr")
-    part = tmp_path / "scenes.zarr" / "part-00000" / "s0" / "c" / "0"
-    content = bytearray(part.read_bytes())
-    content[len(content) // 2] ^= 1
-    part.write_bytes(content)
+    flip(tmp_path / "scenes.zarr" / "part-00000" / "s0" / "c" / "0")
     arguments = [*TINY, f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
     done = preloaded.run_stage(project_root, "emulate", arguments)
     assert done.returncode == 1
@@ -193,15 +176,15 @@ def test_the_same_values_give_the_same_bytes_whatever_the_number_of_workers(proj
     for stage in ("ingest", "synthesize", "emulate"):
         run_stage(project_root, stage, tmp_path, "runtime.workers=2", "runtime.threads=2")
     for name in GENERATED:
-        assert bytes_of(tmp_path / name) == bytes_of(data / name), name
+        assert files_of(tmp_path / name) == files_of(data / name), name
 
 
 @pytest.mark.thorough
 def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project_root, data, tmp_path):
     parts = ("train", "benchmark")
-    before = {name: bytes_of(data / name) for name in parts}
+    before = {name: files_of(data / name) for name in parts}
     run_stage(project_root, "trial", data, "loss.ssim=0.5", f"hydra.sweep.dir={tmp_path}", "--multirun")
-    assert {name: bytes_of(data / name) for name in parts} == before
+    assert {name: files_of(data / name) for name in parts} == before
     (point,) = sweep_points(tmp_path)
     assert "loss.ssim=0.5" in point["overrides"]
     own = json.loads((tmp_path / point["job"] / "benchmark" / "metrics.json").read_text())["simulated"]
@@ -231,8 +214,17 @@ def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_the
     assert ">high-pass<" not in reduced
 
 
-def test_a_later_stage_without_its_input_says_which_stage_makes_it(project_root, tmp_path):
-    arguments = [f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
-    done = preloaded.run_stage(project_root, "emulate", arguments)
+@pytest.mark.parametrize(
+    ("stage", "overrides", "message"),
+    [
+        ("emulate", [], "run the stage that writes it"),
+        ("train", ["benchmark.methods=[zeros,e2v,ours]", "baseline=e2p"],
+         "no row of benchmark.methods uses the weights of baselines.e2p"),
+    ],
+)  # fmt: skip
+def test_a_stage_without_its_input_or_that_nothing_uses_says_so(project_root, tmp_path, stage, overrides, message):
+    arguments = [*TINY, *overrides, f"paths.data={tmp_path / 'data'}", f"hydra.run.dir={tmp_path / 'log'}"]
+    done = preloaded.run_stage(project_root, stage, arguments)
     assert done.returncode != 0
-    assert "run the stage that writes it" in done.stdout
+    assert message in done.stdout
+    assert not (tmp_path / "data").exists()

@@ -14,22 +14,9 @@ from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.presets import SENSORS
 
 V2E_CASES = [
-    "clean",
-    "clean_synth",
-    "clean_float",
-    "clean_irregular",
-    "clean_t0_2p5",
-    "asym_thres",
-    "cutoff15",
-    "cutoff15_synth",
-    "cutoff300",
-    "refractory5ms",
-    "refractory0p5ms",
-    "leak5",
-    "leak_map",
-    "thres_map",
-    "combined",
-]
+    "clean", "clean_synth", "clean_float", "clean_irregular", "clean_t0_2p5", "asym_thres", "cutoff15",
+    "cutoff15_synth", "cutoff300", "refractory5ms", "refractory0p5ms", "leak5", "leak_map", "thres_map", "combined",
+]  # fmt: skip
 MAPS = {
     "pos_map": ("threshold_on", "map_pos_thres"),
     "neg_map": ("threshold_off", "map_neg_thres"),
@@ -105,10 +92,7 @@ def arrays_in_order(events: Events) -> list[np.ndarray]:
 @pytest.mark.parametrize("name", V2E_CASES)
 def test_v2e_case(golden, described, name):
     case = described["cases"][name]
-    frames, t_us = (
-        clip(golden, case["clip"]),
-        times_us(golden, case["times"]),
-    )
+    frames, t_us = clip(golden, case["clip"]), times_us(golden, case["times"])
     t_us[0] = 0  # v2e takes the first frame for time 0 even where its clip begins at 2.5 s
     config = v2e_config(case["params"])
     _, state = emulate(frames[:1], t_us[:1], config, key=1)

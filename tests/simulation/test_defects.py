@@ -8,11 +8,11 @@ import pytest
 import torch
 from event_fixtures import arrays_of
 from scipy import stats
+from simulation_fixtures import QUIET, moving_bars
 
 from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate
 from polarnet.simulation.presets import SENSORS
 
-QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 SIDE = 100  # pixels
 CHANNEL = SIDE * SIDE
 
@@ -25,36 +25,21 @@ def constant(config: EmulatorConfig, dn: float, seconds: float):
     return arrays_of(events)
 
 
-def bars() -> torch.Tensor:
-    """Twelve frames of two channels in which bright and dark bars drift."""
-    phase = torch.arange(40.0) / 6 - torch.arange(12.0).view(-1, 1, 1, 1) / 3
-    return (127.5 + 100 * torch.sin(phase)).expand(-1, 2, 24, -1).contiguous()
-
-
 def places_of(events) -> np.ndarray:
     return np.asarray(events.y).astype(int) * 1000 + np.asarray(events.x)
-
-
-def places(events) -> np.ndarray:
-    return np.unique(places_of(events))
 
 
 def rows_of(events, which) -> list[list[int]]:
     return [getattr(events, name)[which].tolist() for name in "txyp"]
 
 
-def test_hot_pixels_have_the_configured_share_and_rate_and_both_polarities():
-    columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=50.0), 100.0, 4.0)
-    hot = len(places(columns))  # a hot pixel without an event in 4 s has probability exp(-200)
-    assert hot == pytest.approx(0.02 * CHANNEL, abs=3 * math.sqrt(0.02 * CHANNEL))
-    expected = hot * 50.0 * 4.0
-    assert len(columns.t) == pytest.approx(expected, abs=3 * math.sqrt(expected))
-    assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(expected))
-
-
-def test_a_hot_pixel_is_a_poisson_process():
+def test_hot_pixels_have_the_configured_share_and_are_poisson_processes_of_either_polarity():
     columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=20.0), 100.0, 10.0)
     pixel = columns.y.astype(int) * SIDE + columns.x
+    hot = len(np.unique(pixel))  # a hot pixel without an event in 10 s has probability exp(-200)
+    assert hot == pytest.approx(0.02 * CHANNEL, abs=3 * math.sqrt(0.02 * CHANNEL))
+    assert len(columns.t) == pytest.approx(200 * hot, abs=3 * math.sqrt(200 * hot))
+    assert columns.p.sum() == pytest.approx(0, abs=3 * math.sqrt(200 * hot))
     order = np.lexsort((columns.t, pixel))
     following = pixel[order][1:] == pixel[order][:-1]
     gaps_s = np.diff(columns.t[order])[following] * 1e-6
@@ -70,7 +55,7 @@ def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
     config = dataclasses.replace(QUIET, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
     dark, still = constant(config, 1.0, 0.5), constant(config, 240.0, 0.5)
     assert np.array_equal(dark.t, still.t)
-    frames, t_us = bars(), 3333 * torch.arange(12)
+    frames, t_us = moving_bars(2), 3333 * torch.arange(12)
     moving, _ = emulate(frames, t_us, dataclasses.replace(config, model=model), key=7)
     at_rest, _ = emulate(frames[:1].expand_as(frames), t_us, dataclasses.replace(config, model=model), key=7)
     for channel, hot in zip(moving, at_rest, strict=True):
@@ -82,14 +67,14 @@ def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
 @pytest.mark.parametrize("model", list(MODELS))
 def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
     config = dataclasses.replace(SENSORS["default"], model=model, shot_noise_rate_hz=5.0)
-    frames, t_us = bars(), 3333 * torch.arange(12)
+    frames, t_us = moving_bars(2), 3333 * torch.arange(12)
     healthy, _ = emulate(frames, t_us, config, key=7)
     partly, _ = emulate(frames, t_us, dataclasses.replace(config, dead_pixel_share=0.2), key=7)
     silent = []
     for before, after in zip(healthy, partly, strict=True):
-        dead = np.setdiff1d(places(before), places(after))
+        dead = np.setdiff1d(places_of(before), places_of(after))
         assert len(dead) == pytest.approx(0.2 * 960, abs=3 * math.sqrt(0.16 * 960))
-        alive = torch.from_numpy(~np.isin(before.y.numpy().astype(int) * 1000 + before.x.numpy(), dead))
+        alive = torch.from_numpy(~np.isin(places_of(before), dead))
         for name in "txyp":
             assert torch.equal(getattr(after, name), getattr(before, name)[alive])
         silent.append(dead)

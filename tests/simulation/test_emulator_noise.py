@@ -8,12 +8,11 @@ import pytest
 import torch
 from event_fixtures import arrays_of
 from scipy import stats
+from simulation_fixtures import QUIET
 
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
-from polarnet.simulation.presets import SENSORS
 
-QUIET = dataclasses.replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 SIDE = 64  # pixels
 
 

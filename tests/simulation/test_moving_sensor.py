@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
+from simulation_fixtures import REST, STILL
 from skimage import data
 
-from polarnet.events.stream import validate
+from polarnet.events.stream import concatenate, validate
 from polarnet.simulation.camera import IDEAL, Camera, weights_of
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render, resting_trajectory
+from polarnet.simulation.motion import Pose, Sine, Trajectory, render, resting_trajectory
 from polarnet.simulation.moving_sensor import (
     channel_light,
     check_inside,
@@ -25,14 +27,12 @@ from polarnet.simulation.scene import scene_from_rgb
 from polarnet.stokes import intensities_from_stokes
 
 CONFIG = dataclasses.replace(SENSORS["default"], leak_rate_hz=0.1, shot_noise_rate_hz=1.0)
-STILL = Sine(0.0, 0.0, 0.0)
 H, W = 24, 32
 
 
 def trajectory(roll: float = 0.0, zoom: float = 0.0, speed: float = 150.0) -> Trajectory:
     """A sensor that swings 20 px to either side, 8 px up and down, and turns and zooms as asked."""
-    rest = [STILL] * (HARMONICS - 1)
-    x, y = (Sine(20.0, 6.0, 0.3), *rest), (Sine(8.0, 9.0, 1.1), *rest)
+    x, y = (Sine(20.0, 6.0, 0.3), *REST[1:]), (Sine(8.0, 9.0, 1.1), *REST[1:])
     return Trajectory(60.3, 40.7, x, y, Sine(roll, 5.0, 0.2), Sine(zoom, 4.0, 0.4), speed_px_s=speed)
 
 
@@ -44,10 +44,6 @@ def scene():
 
 def times_us(n: int = 61) -> np.ndarray:
     return np.rint(np.arange(n) * 1e6 / 300).astype(np.int64)
-
-
-def same(a, b) -> bool:
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("t", "x", "y", "p"))
 
 
 def test_a_drifting_sensor_sees_what_render_sees(scene):
@@ -94,24 +90,18 @@ def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model,
     camera = Camera(config, key=5)
     whole = emulate_motion(camera, scene, path, 200_000, (H, W))
     threaded = emulate_motion(camera, scene, path, 200_000, (H, W), threads=2)
-    assert all(same(a, b) for a, b in zip(whole, threaded, strict=True))
+    assert all(equal(a, b) for a, b in zip(whole, threaded, strict=True))
     t_us, state, pieces = render_times_us(path, 200_000, H, W, config), None, []
     for first in range(0, len(t_us), 23):
         events, state = emulate_motion_steps(camera, scene, path, t_us[first : first + 23], (H, W), state)
         pieces.append(events)
-    for polarizer in range(4):
-        for name in ("t", "x", "y", "p"):
-            joined = torch.cat([getattr(piece[polarizer], name) for piece in pieces])
-            assert torch.equal(joined, getattr(whole[polarizer], name))
+    assert all(equal(concatenate(parts), all_) for parts, all_ in zip(zip(*pieces, strict=True), whole, strict=True))
 
 
-def test_v2e_renders_at_regular_times():
-    t_us = render_times_us(trajectory(), 100_000, H, W, dataclasses.replace(CONFIG, model="v2e"))
-    assert t_us.tolist() == [round(k * 1e6 / 300) for k in range(31)]
-
-
-def test_a_rate_that_does_not_divide_the_duration_ends_with_it():
-    config = dataclasses.replace(CONFIG, model="v2e", render_rate_hz=100.0)
+def test_v2e_renders_at_regular_times_and_at_the_end():
+    config = dataclasses.replace(CONFIG, model="v2e")
+    assert render_times_us(trajectory(), 100_000, H, W, config).tolist() == [round(k * 1e6 / 300) for k in range(31)]
+    config = dataclasses.replace(config, render_rate_hz=100.0)
     assert render_times_us(trajectory(), 25_000, H, W, config).tolist() == [0, 10_000, 20_000, 25_000]
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from polarnet.simulation.pixels import light, randomness
+from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.light import KNEE, Light, intensity_rows, linlog, linlog_8bit, linlog_as_v2e
 from polarnet.simulation.pixels.physics import mismatch, physics_of
 from polarnet.simulation.presets import SENSORS
@@ -32,11 +32,6 @@ def test_scene_pixels_are_mixed_by_area_even_where_they_do_not_lie_on_a_plane():
     """(1 - 1/4)(1 - 1/2) 8 + (1 - 1/4) 1/2 16 + 1/4 (1 - 1/2) 32 + 1/4 1/2 80 = 3 + 6 + 4 + 10."""
     scene = np.array([[[8, 16], [32, 80]]], np.float32)
     assert rows_of(Light(scene, np.array([0.25]), np.array([0.5])), 0, 0, 1, 1) == [[23]]
-
-
-def test_a_clip_shows_the_rows_of_its_frames():
-    clip = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
-    assert rows_of(light.light_of_frames(clip), 1, 1, 4, 2) == clip[1, 1:].tolist()
 
 
 def test_response_is_linear_to_the_knee_and_a_logarithm_right_to_its_bound_above():

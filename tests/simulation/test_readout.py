@@ -22,30 +22,23 @@ def triples(events: Events) -> list[tuple[int, int, int]]:
     return list(zip(events.t.tolist(), events.y.tolist(), events.x.tolist(), strict=True))
 
 
-def test_each_row_is_late_by_its_number_times_the_latency():
-    events = events_at((10, 5, 0), (11, 0, 1), (20, 2, 2))
-    leaving, lost = read_out(events, dataclasses.replace(PERFECT, row_latency_us=2.0), key=1, duration_us=100)
-    assert triples(leaving) == [(11, 0, 1), (20, 5, 0), (24, 2, 2)]
-    assert lost == 0
-
-
-def test_a_row_leaves_together_when_the_bus_has_carried_it():
-    """A million events a second: two of row 3 leave at 12, and the one of row 4 waits for them and leaves at 13."""
-    events = events_at((10, 3, 0), (10, 3, 7), (11, 4, 1))
-    config = dataclasses.replace(PERFECT, max_events_per_s=1e6)
-    leaving, lost = read_out(events, config, key=1, duration_us=100)
-    assert triples(leaving) == [(12, 3, 0), (12, 3, 7), (13, 4, 1)]
-    assert lost == 0
-
-
-def test_a_row_that_would_wait_too_long_is_lost_whole_and_takes_no_time():
-    """Ten events of row 0 keep the bus busy from 0 to 100; row 1 would wait 95 of allowed 20, row 2 waits 10."""
-    events = events_at(*((0, 0, x) for x in range(10)), (5, 1, 0), (5, 1, 1), (90, 2, 0))
-    config = dataclasses.replace(PERFECT, max_events_per_s=1e5, max_wait_us=20.0)
-    leaving, lost = read_out(events, config, key=1, duration_us=1000)
-    assert lost == 2
-    assert triples(leaving)[-1] == (110, 2, 0)
-    assert len(leaving) == 11
+@pytest.mark.parametrize(
+    ("changes", "rows", "expected", "expected_lost"),
+    [
+        # each row is late by its number times the latency; events that leave after the end at 1000 are missing
+        ({"row_latency_us": 2.0}, [(10, 5, 0), (11, 0, 1), (20, 2, 2)], [(11, 0, 1), (20, 5, 0), (24, 2, 2)], 0),
+        ({"row_latency_us": 1.0}, [(10, 0, 0), (995, 9, 0)], [(10, 0, 0)], 0),
+        # a row leaves when the bus has carried all of it: at 12, and the one of row 4 waits for it and leaves at 13
+        ({"max_events_per_s": 1e6}, [(10, 3, 0), (10, 3, 7), (11, 4, 1)], [(12, 3, 0), (12, 3, 7), (13, 4, 1)], 0),
+        # ten events of row 0 need the bus to 100: row 1 would wait 95 of allowed 20 and is lost whole, row 2 waits 10
+        ({"max_events_per_s": 1e5, "max_wait_us": 20.0},
+         [*((0, 0, x) for x in range(10)), (5, 1, 0), (5, 1, 1), (90, 2, 0)],
+         [*((100, 0, x) for x in range(10)), (110, 2, 0)], 2),
+    ],
+)  # fmt: skip
+def test_rows_leave_one_after_another_as_the_bus_carries_them(changes, rows, expected, expected_lost):
+    leaving, lost = read_out(events_at(*rows), dataclasses.replace(PERFECT, **changes), key=1, duration_us=1000)
+    assert (triples(leaving), lost) == (expected, expected_lost)
 
 
 def test_a_saturated_bus_carries_its_limit():
@@ -72,11 +65,3 @@ def test_jitter_has_the_stated_deviation_depends_on_the_key_and_keeps_time_order
     single = events_at(*((10_000, y, x) for y in range(100) for x in range(100)), height=100, width=100)
     spread, _ = read_out(single, config, key=1, duration_us=30_000)
     assert float(spread.t.double().std()) == pytest.approx(30, rel=0.03)
-
-
-def test_events_after_the_end_of_the_recording_are_missing():
-    leaving, lost = read_out(
-        events_at((10, 0, 0), (95, 9, 0)), dataclasses.replace(PERFECT, row_latency_us=1.0), key=1, duration_us=100
-    )
-    assert triples(leaving) == [(10, 0, 0)]
-    assert lost == 0

@@ -4,6 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
+from simulation_fixtures import QUIET, REST, STILL
 
 from polarnet.config.tree import load
 from polarnet.simulation.camera import Camera, Grid
@@ -18,7 +20,6 @@ from polarnet.storage.frames import Contents, Polarization
 from polarnet.storage.scenes import SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
-STILL = Sine(0.0, 0.0, 0.0)
 
 
 def uniform_scene(s0=0.8, dolp=0.5, aolp=0.0, height=4, width=6):
@@ -54,9 +55,8 @@ def test_unpolarized_light_fires_nothing_behind_a_rotating_polarizer():
 
 def test_dolp_one_half_fires_three_events_down_from_its_mean_and_five_on_each_way_between_its_extremes():
     """ln(1 + 0.5 cos x) falls from 0 to -0.693 and rises to 0.405; thresholds of 0.2 lie at -0.6 and 0.4."""
-    sensor = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
     rotating = replace(ROTATING, start_angle_deg=45.0)
-    events = still_events(sensor, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
+    events = still_events(QUIET, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
     assert events.p.tolist() == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5
 
 
@@ -67,7 +67,7 @@ def test_v2e_sees_eight_bits_of_the_light():
     (expected,), _ = emulate((light[0, :, None] + 0.5).astype(np.uint8), t_us, sensor, key=1)
     events = still_events(sensor, scene, 200_000)
     assert len(events) > 100
-    assert all(torch.equal(getattr(events, name), getattr(expected, name)) for name in "txyp")
+    assert equal(events, expected)
 
 
 def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need():
@@ -99,7 +99,7 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
         tmp_path / "scenes.zarr", Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"}), names,
         largest_picture=(20, 30), sensor=(6, 8), trajectory_names=Trajectory.vector_names(),
     )  # fmt: skip
-    trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), (STILL,) * 3, STILL, STILL, 10.0)
+    trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), REST, STILL, STILL, 10.0)
     maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
     for name in names:
         store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)

@@ -43,16 +43,7 @@ def test_a_colour_has_the_angle_of_its_hue_and_the_degree_of_its_saturation(rgb,
 def test_hue_just_below_red_is_an_angle_just_below_180_degrees():
     angle = math.degrees(polarization_from_rgb(pixel(1.0, 0.0, 0.01))[2].item())
     assert angle == pytest.approx(180 - 0.3, abs=1e-3)  # 0.01 / 6 of the circle of hues below red
-
-
-def test_no_hue_rounds_up_to_180_degrees():
-    almost_red = torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1) + torch.tensor([0, 0, 1e-12]).view(3, 1, 1)
-    assert 0 <= polarization_from_rgb(almost_red)[2].item() < math.pi
-
-
-def test_a_red_pixel_is_bright_behind_0_and_dark_behind_90_degrees():
-    intensities = intensities_from_stokes(scene_from_rgb(pixel(1.0, 0.0, 0.0)).stokes).flatten()
-    torch.testing.assert_close(intensities, torch.tensor([1.0, 0.5, 0.0, 0.5]))
+    assert 0 <= polarization_from_rgb(pixel(1.0, 0.0, 1e-12))[2].item() < math.pi
 
 
 @pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 135])
@@ -95,8 +86,5 @@ def test_numpy_planes_make_the_same_scene():
 def test_degrees_percentages_and_bytes_are_no_polarization(s0, dolp, aolp, message):
     with pytest.raises(ValueError, match=message):
         scene_from_polarization(*(torch.full((2, 2), value) for value in (s0, dolp, aolp)))
-
-
-def test_light_above_white_is_refused():
     with pytest.raises(ValueError, match=r"expected S0 = I0 \+ I90 in \[0, 1\], got values up to 1\.6"):
         scene_from_intensities(torch.full((4, 2, 2), 0.8))

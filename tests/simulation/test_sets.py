@@ -113,8 +113,3 @@ def test_the_kind_is_seen_in_the_names(tmp_path):
         path.unlink()
     (tmp_path / "plate.npz").touch()
     assert kind_of(tmp_path) == "polarization"
-
-
-def test_speeds_the_wrong_way_round_are_refused():
-    with pytest.raises(ValueError, match="speed_max_px_s: expected >= speed_min_px_s 40"):
-        harder(speed_max_px_s=30.0)

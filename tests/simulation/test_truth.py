@@ -9,21 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from part_fixtures import files_of
 from PIL import Image
+from simulation_fixtures import REST, STILL
 
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.camera import grid
-from polarnet.simulation.motion import (
-    HARMONICS,
-    Sine,
-    SynthesizeConfig,
-    Trajectory,
-    frame_times_us,
-    random_trajectory,
-    render,
-)
+from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.presets import MOTIONS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
@@ -36,13 +30,6 @@ CONFIG = dataclasses.replace(
     MOTIONS["default"], sequences_per_picture=2, duration_s=0.2, sensor_height=24, sensor_width=36, speed_min_px_s=60.0,
     speed_max_px_s=200.0, acceleration_max_px_s2=2000.0, rotation_max_deg=10.0, zoom_max=1.2,
 )  # fmt: skip
-
-
-@pytest.fixture
-def threads_as_they_were():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -70,10 +57,6 @@ def run(images: Path, folder: Path, config: SynthesizeConfig = CONFIG, mapper=ma
 @pytest.fixture(scope="module")
 def stores(images, tmp_path_factory) -> tuple[SceneStore, FrameStore]:
     return run(images, tmp_path_factory.mktemp("stores"))
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
@@ -142,37 +125,35 @@ def test_the_truth_follows_from_the_four_intensities_by_equations_1_to_3(stores)
     assert turn[polarized].abs().max() < 1e-3
 
 
-def test_a_run_killed_half_way_ends_with_the_same_bytes(images, stores, tmp_path):
-    def dies_after_two(function, items):
-        for item in items[:2]:
+def killed(images: Path, folder: Path, parts: int) -> None:
+    """A run that dies after some parts."""
+
+    def dies(function, items):
+        for item in items[:parts]:
             function(item)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(images, tmp_path, mapper=dies_after_two)
-    assert not (tmp_path / "frames.zarr").exists()
-    redone = []
-    run(images, tmp_path, mapper=lambda function, items: redone.extend(items) or [function(item) for item in items])
-    assert len(redone) == 3
-    undisturbed = Path(stores[0].path).parent
+        run(images, folder, mapper=dies)
+    assert not (folder / "frames.zarr").exists()
+
+
+def parts_made_by(images: Path, folder: Path, config: SynthesizeConfig = CONFIG) -> int:
+    made = []
+    run(images, folder, config, lambda function, items: made.extend(items) or [function(item) for item in items])
+    return len(made)
+
+
+def test_a_run_killed_half_way_ends_with_the_same_bytes(images, stores, tmp_path):
+    killed(images, tmp_path, parts=2)
+    assert parts_made_by(images, tmp_path) == 3
     for name in ("scenes.zarr", "frames.zarr"):
-        assert files(tmp_path / name) == files(undisturbed / name)
+        assert files_of(tmp_path / name) == files_of(Path(stores[0].path).parent / name)
 
 
 def test_another_setting_is_not_mixed_with_what_an_interrupted_run_left(images, tmp_path):
-    def dies(function, items):
-        function(items[0])
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(images, tmp_path, mapper=dies)
-    redone = []
-    faster = dataclasses.replace(CONFIG, speed_min_px_s=150.0)
-    run(images, tmp_path, faster, lambda function, items: redone.extend(items) or [function(item) for item in items])
-    assert len(redone) == 5
-
-
-STILL = Sine(0.0, 0.0, 0.0)
+    killed(images, tmp_path, parts=1)
+    assert parts_made_by(images, tmp_path, dataclasses.replace(CONFIG, speed_min_px_s=150.0)) == 5
 
 
 @pytest.mark.parametrize(
@@ -187,8 +168,7 @@ STILL = Sine(0.0, 0.0, 0.0)
 def test_a_pixel_is_valid_unless_its_interpolation_uses_a_masked_one(x, y, expected):
     valid = torch.ones(12, 16, dtype=torch.bool)
     valid[7, 8] = False
-    rest = (STILL,) * HARMONICS
-    trajectory = Trajectory(x, y, rest, rest, STILL, STILL, speed_px_s=1.0)
+    trajectory = Trajectory(x, y, REST, REST, STILL, STILL, speed_px_s=1.0)
     (seen,) = valid_frames(valid, trajectory, [0], height=6, width=6)  # its first pixel looks at (x, y) - 2.5
     assert [tuple(place) for place in (~seen).nonzero().tolist()] == expected
 
@@ -207,7 +187,7 @@ def test_the_mask_of_a_turning_window_is_that_of_its_weights():
     assert 0.8 < rendered.float().mean() < 0.98
 
 
-def test_the_number_of_threads_changes_no_bit_of_a_frame(threads_as_they_were):
+def test_the_number_of_threads_changes_no_bit_of_a_frame():
     config = dataclasses.replace(CONFIG, sensor_height=121, sensor_width=179, duration_s=0.4)
     generator = np.random.default_rng(0)
     s0, degree, angle = torch.rand(3, 300, 400, generator=torch.Generator().manual_seed(0))
@@ -228,8 +208,7 @@ def test_the_truth_of_a_mosaic_is_that_of_the_centres_of_its_cells():
     """Each cell's truth is the mean of the four pixels' Stokes parameters where the sensor stands on whole pixels."""
     generator = torch.Generator().manual_seed(3)
     scene = scene_from_polarization(*torch.rand(3, 40, 60, generator=generator))
-    still = Sine(0.0, 0.0, 0.0)
-    trajectory = Trajectory(29.5, 19.5, (still,), (still,), still, still, 0.0)
+    trajectory = Trajectory(29.5, 19.5, REST, REST, STILL, STILL, 0.0)
     rows, columns, pitch = grid("dofp", 20, 30)
     intensities, degree, _ = frames_of(scene, trajectory, [0], rows, columns, pitch)
     cells = torch.nn.functional.avg_pool2d(scene.stokes[None, :, 10:30, 15:45], 2)[0]

@@ -8,14 +8,12 @@ import pytest
 import torch
 from event_fixtures import arrays_of
 from scipy import stats
+from simulation_fixtures import QUIET
 
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
-from polarnet.simulation.presets import SENSORS
 
-CONFIG = dataclasses.replace(
-    SENSORS["clean"], model="dvs_voltmeter", contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0
-)
+CONFIG = dataclasses.replace(QUIET, model="dvs_voltmeter")
 SIDE = 50
 
 

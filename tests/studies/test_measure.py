@@ -89,16 +89,13 @@ def swept(root, write_trial, **mse):
 
 
 def test_an_ablation_shows_the_unchanged_network_first_and_then_the_worst(tmp_path, write_trial):
-    sweep = swept(tmp_path, write_trial, sums=0.05, scales=0.06, nothing=0.03)
-    rows = json.loads(measure_ablation(sweep, tmp_path).read_text())["ablation"]["rows"]
+    with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
+        measure_ablation(swept(tmp_path / "lacking", write_trial, sums=0.05), tmp_path / "lacking")
+    sweep = swept(tmp_path / "whole", write_trial, sums=0.05, scales=0.06, nothing=0.03)
+    rows = json.loads(measure_ablation(sweep, tmp_path / "whole").read_text())["ablation"]["rows"]
     assert {name: (row["about"], row["mse"]) for name, row in rows.items()} == {
         "nothing": ("Without nothing.", 0.03), "scales": ("Without scales.", 0.06), "sums": ("Without sums.", 0.05),
     }  # fmt: skip
-
-
-def test_an_ablation_needs_the_whole_to_compare_with(tmp_path, write_trial):
-    with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
-        measure_ablation(swept(tmp_path, write_trial, sums=0.05), tmp_path)
 
 
 def test_figures_of_a_changed_tree_may_be_measured_but_not_written(monkeypatch, capsys):

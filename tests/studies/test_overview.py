@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.reports.maps import png
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.panels import Panel, Shown, fraction_bytes
@@ -48,13 +47,9 @@ def test_the_outline_has_the_size_of_the_sensor_and_lies_on_the_picture(overview
     assert (overview.outline.max(axis=1) <= np.array(overview.picture.shape[1::-1]) + 1).all()
 
 
-def test_the_overview_has_the_same_bytes_each_time(overview):
-    assert png(overview_figure(overview)) == png(overview_figure(overview))
-
-
 @pytest.mark.parametrize(
     ("direction_deg", "colour"),
-    [(0, (255, 0, 0)), (60, (0, 255, 0)), (120, (0, 0, 255)), (180, (255, 0, 0)), (240, (0, 255, 0))],
+    [(0, (255, 0, 0)), (60, (0, 255, 0)), (120, (0, 0, 255)), (180, (255, 0, 0))],
 )
 def test_the_wheel_shows_at_each_direction_the_colour_of_that_angle(direction_deg, colour):
     middle, radius, angle = 200, 196, np.radians(direction_deg)

@@ -21,21 +21,16 @@ def scores(factor: float = 2.0) -> Scores:
     return Scores(rows, DOLP, {})
 
 
-def test_errors_are_means_and_medians_over_scenes_relative_to_the_oracle_mean():
-    row = table_of(scores())["rows"]["ours"]
-    assert row["mse"] == pytest.approx(2 * sum(ERRORS.values()) / 3)
-    assert row["mse_over_oracle_mean"] == row["median_over_oracle_mean"] == pytest.approx(2)
-
-
-def test_sensors_are_compared_with_the_default_one():
-    tables = {"sensors.default": table_of(scores()), "sensors.noisy": table_of(scores(factor=3.0))}
-    assert headlines(tables, "ours")["sensors"]["worst_over_default"] == pytest.approx(1.5)
-
-
-def test_measured_scenes_are_compared_with_the_best_row_that_needs_no_truth():
+def test_headlines_compare_mean_errors_over_scenes_with_the_oracle_mean_and_the_best_baseline():
     rows = table_of(scores())
+    assert rows["rows"]["ours"]["mse"] == pytest.approx(2 * sum(ERRORS.values()) / 3)
+    assert rows["rows"]["ours"]["mse_over_oracle_mean"] == rows["rows"]["ours"]["median_over_oracle_mean"]
+    assert rows["rows"]["ours"]["median_over_oracle_mean"] == pytest.approx(2)
     rows["rows"]["ours"]["error_factor"] = 1.2
-    assert headlines({"measured": rows}, "ours")["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
+    tables = {"sensors.default": rows, "sensors.noisy": table_of(scores(factor=3.0)), "measured": rows}
+    lines = headlines(tables, "ours")
+    assert lines["sensors"]["worst_over_default"] == pytest.approx(1.5)
+    assert lines["measured"]["mse_over_best_baseline"] == pytest.approx(0.2)
 
 
 def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):

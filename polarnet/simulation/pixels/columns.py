@@ -1,6 +1,7 @@
 """Events of one channel as growing columns, and those of one step, brought into the order (t, y, x, p).
 
-The kernels collect the events of a step pixel by pixel, each as one integer (`event_of`).
+The kernels collect the events of a step pixel by pixel, each as one integer (`event_of`). Defective pixels lose theirs
+here, and hot ones get their own.
 """
 
 import math
@@ -9,9 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.simulation.compilation import compiled, inlined
+from polarnet.simulation.pixels import randomness
+from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 
 TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, PLACE_MASK = np.int64(31), np.int64(16), np.int64(1), np.int64(0x7FFF)
 EVENT_BYTES = 8 + 2 + 2 + 1
+SPAN_US = 1 << 16  # span of time whose events a hot pixel draws independently of other spans
 MAX_BUCKETS = 4096  # buckets of the counting sort; a step shorter than 4096 us has one bucket per microsecond
 
 
@@ -30,11 +34,6 @@ def empty_columns(capacity: int) -> Columns:
     block = np.empty(capacity * EVENT_BYTES, np.uint8)
     t, x, y, p = np.split(block, [8 * capacity, 10 * capacity, 12 * capacity])
     return Columns(t.view(np.int64), x.view(np.int16), y.view(np.int16), p.view(np.int8))
-
-
-def trimmed(columns: Columns, count: int) -> Columns:
-    """The first `count` events."""
-    return Columns(*(column[:count] for column in columns))
 
 
 @compiled
@@ -73,10 +72,16 @@ def event_of(offset_us, place, on):
 
 
 @compiled
-def write_in_order(pending, n, start_us, stop_us, columns, used):
-    """Append n pending events of a step to the `used` of the columns in the order (t, y, x, p); return both."""
+def write_in_order(steps, k, pending, n, columns, used):
+    """Append the n pending events of step k to the `used` of the columns in the order (t, y, x, p); return both."""
+    start_us, stop_us = steps.times_us[k], steps.times_us[k + 1]
+    if steps.defects.silent.size:
+        pending, n = _with_defects(steps, start_us, stop_us, pending, n)
     base_us = np.int64(math.floor(start_us))
-    columns = with_room(columns, used, n)
+    if used + n > columns.t.size:
+        t, x, y, p = columns
+        size = max(2 * t.size, used + n)
+        columns = Columns(_grown(t, used, size), _grown(x, used, size), _grown(y, used, size), _grown(p, used, size))
     in_order = _sorted(pending[:n], np.int64(math.ceil(stop_us)) - base_us)
     t, x, y, p = columns.t[used : used + n], columns.x[used:], columns.y[used:], columns.p[used:]
     for i in range(n):
@@ -86,23 +91,47 @@ def write_in_order(pending, n, start_us, stop_us, columns, used):
         y[i] = event >> ROW_SHIFT & PLACE_MASK
         p[i] = (event & np.int64(1)) * np.int64(2) - np.int64(1)
     # a step that does not start at a whole microsecond can share one with the step before it
-    tied = first_tied(columns, used, used + n)
+    tied = used
+    while n > 0 and tied > 0 and columns.t[tied - 1] >= columns.t[used]:
+        tied -= 1
     if tied < used:
-        sort_ties(columns, tied, used + n)
+        _sort_ties(columns, tied, used + n)
     return columns, used + n
 
 
 @compiled
-def first_tied(columns, used, stop):
-    """Index of the first event that is not before event `used`; `used` itself if no event was added up to `stop`."""
-    tied = used
-    while stop > used and tied > 0 and columns.t[tied - 1] >= columns.t[used]:
-        tied -= 1
-    return tied
+def _with_defects(steps, start_us, stop_us, pending, n):
+    """The pending events of a step without those of defective pixels and with those of hot ones, and their number.
+
+    Hot pixels fire at times start <= t < stop, rounded down to whole microseconds, or up if `defects.round_up`.
+    """
+    defects, kept, mean_us = steps.defects, 0, 1e6 / steps.defects.rate_hz
+    for m in range(n):
+        event = pending[m]
+        pending[kept] = event
+        pixel = (event >> ROW_SHIFT & PLACE_MASK) * steps.width + (event >> COLUMN_SHIFT & PLACE_MASK)
+        kept += not defects.silent[pixel]
+    key = ~key_for(steps.key, randomness.HOT, steps.channel)  # the key itself chose the pixels
+    for i in defects.hot:
+        pixel_key, place = mixed(key, i), place_of(i // steps.width, i % steps.width)
+        for span in range(math.floor(start_us / SPAN_US), math.ceil(stop_us / SPAN_US)):
+            span_key, draw = mixed(pixel_key, span), 0
+            time_us = span * SPAN_US - math.log(uniform(mixed(span_key, draw))) * mean_us
+            while time_us < min(np.float64((span + 1) * SPAN_US), stop_us):
+                if time_us >= start_us:
+                    if kept == pending.size:
+                        pending = roomier(pending)
+                    whole_us = math.ceil(time_us) if defects.round_up else math.floor(time_us)
+                    on = mixed(span_key, draw + 1) >> np.uint64(63)
+                    pending[kept] = event_of(whole_us - math.floor(start_us), place, on)
+                    kept += 1
+                draw += 2
+                time_us -= math.log(uniform(mixed(span_key, draw))) * mean_us
+    return pending, kept
 
 
 @compiled
-def sort_ties(columns, start, stop):
+def _sort_ties(columns, start, stop):
     """Sort the events from `start` up to `stop` by (t, y, x, p), in place."""
     events = np.empty(stop - start, np.int64)
     for i in range(events.size):

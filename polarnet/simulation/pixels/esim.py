@@ -12,7 +12,6 @@ from pydantic import PositiveFloat
 
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import ZERO, compiled
-from polarnet.simulation.pixels.active import rows_of_strip
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.physics import PixelConfig
@@ -91,21 +90,16 @@ def start(light, pixels, steps):
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    times_us, h, w = steps.times_us, steps.height, steps.width
-    rows, table, used = rows_of_strip(h, w), _table(steps.physics), ZERO
-    strip = np.empty((2, rows * w), np.float32)
-    pending = np.empty(h * w, np.int64)
-    for k in range(times_us.size - 1):
+    w, table, used = steps.width, _table(steps.physics), ZERO
+    dn, logarithm = np.empty((2, w), np.float32)
+    pending = np.empty(steps.height * w, np.int64)
+    for k in range(steps.times_us.size - 1):
         n = ZERO
-        for y in range(0, h, rows):
-            first, stop = y * w, min(y + rows, h) * w
-            dn, logarithm = strip[0, : stop - first], strip[1, : stop - first]
+        for y in range(steps.height):
             _respond(light, steps.first_frame + k, steps, y, table, dn, logarithm)
-            for r in range(y, min(y + rows, h)):
-                here = slice((r - y) * w, (r - y + 1) * w)
-                pending, n = _fire(pixels, steps, k, r, logarithm[here], pending, n)
-            pixels.logarithm[first:stop] = logarithm
-        columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
+            pending, n = _fire(pixels, steps, k, y, logarithm, pending, n)
+            pixels.logarithm[y * w : (y + 1) * w] = logarithm
+        columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 

@@ -150,7 +150,7 @@ def advance(light, pixels, steps, columns):
             for y in range(0, h, rows):
                 if soonest_us[y // rows] < stop_us:
                     soonest_us[y // rows] = pixels.next_shot_us[y * w : (y + rows) * w].min()
-        columns, used = write_in_order(pending, n, start_us, stop_us, columns, used)
+        columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 

@@ -78,7 +78,7 @@ def advance(light, pixels, steps, columns):
         for y in range(h):
             intensity_rows(light, steps.first_frame + k, y, w, dn)
             pending, n = _walk(pixels, steps, k, key, y, dn, pending, n)
-        columns, used = write_in_order(pending, n, times_us[k], times_us[k + 1], columns, used)
+        columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 
