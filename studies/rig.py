@@ -35,7 +35,7 @@ from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, recor
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
-from polarnet.storage.exchange import write_hdf5
+from polarnet.recordings.writers import write_hdf5
 from polarnet.storage.frames import FrameStore
 from studies.simulated_rig import RigConfig, RigTruth, spread_us, true_dolp, write_rig
 from studies.simulation_pictures import few_colours

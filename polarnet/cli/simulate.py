@@ -25,7 +25,7 @@ from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.scene import PolarizationScene, scene_from_intensities, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import parse_mosaic
-from polarnet.storage.exchange import h5py_module
+from polarnet.recordings.writers import h5py_module
 
 PHOTOGRAPH = "astronaut"
 

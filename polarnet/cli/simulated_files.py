@@ -19,7 +19,7 @@ from polarnet.reports.preview import write_true_video
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.events import MAX_DURATION_US, EventStore
-from polarnet.storage.exchange import FORMS
+from polarnet.recordings.writers import FORMS
 from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise_angle, quantise_fraction
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.true_frames import APPENDED, open_truth

@@ -12,7 +12,7 @@ from polarnet.events.streaming import SHORTEST_STEP_US, EventWindow, WindowCutte
 from polarnet.methods.between import Between, BetweenConfig, anchored, carried
 from polarnet.methods.method import Recoverer, each_map
 from polarnet.methods.overlap import advance, begin, warm_up
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.stream import Frame, Input, runs_of
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 

@@ -7,7 +7,7 @@ from event_fixtures import events_of, random_events
 
 from polarnet.cli import main
 from polarnet.recordings.recording import read_recording
-from polarnet.storage.exchange import write_text
+from polarnet.recordings.writers import write_text
 
 EVENTS = [(1_000_000, 3, 4, 1), (1_250_000, 5, 6, -1), (1_500_000, 0, 0, 1), (1_750_000, 7, 7, -1)]
 

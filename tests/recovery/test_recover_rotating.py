@@ -13,7 +13,7 @@ from polarnet.simulation.motion import resting_trajectory
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import scene_from_polarization
-from polarnet.storage.exchange import write_hdf5
+from polarnet.recordings.writers import write_hdf5
 
 HEIGHT, WIDTH, RATE_HZ, START_DEG = 8, 10, 5.0, 20.0
 

@@ -10,7 +10,7 @@ import torch
 
 from polarnet.recordings.recording import read_recording
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import export_store, write_evt3, write_hdf5, write_text
+from polarnet.recordings.writers import export_store, write_evt3, write_hdf5, write_text
 
 HEIGHT, WIDTH = 12, 18
 
