@@ -65,7 +65,7 @@ class _Stream:
         good = usable(Block(t, x, y, np.where(p == -1, 0, p)), *self._sensor, 0, self.counts)
         p = np.where(p > 0, 1, -1)
         if angle:
-            channel = np.searchsorted(POLARIZER_ANGLES_DEG[1:], angle[0])
+            channel = np.searchsorted(POLARIZER_ANGLES_DEG[:-1], angle[0])
             known = np.array(POLARIZER_ANGLES_DEG)[channel] == angle[0]
             self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
             good &= known
@@ -117,9 +117,9 @@ class LiveLines:
         for data, read_at in self._lines:
             rows = [nothing, *rows_of(data, shift, self.counts, "unreadable_lines")]
             lines += data.count(b"\n")
-            for block in self._stream.add(np.concatenate(rows), read_at, flush=not data):
-                refuse_much_damage(self.name, self.counts, lines, (*SAFE, "time_glitches"))
-                yield block
+            blocks = list(self._stream.add(np.concatenate(rows), read_at, flush=not data))
+            refuse_much_damage(self.name, self.counts, lines, (*SAFE, "time_glitches"))
+            yield from blocks
         yield from self._stream.add(nothing, 0.0, flush=True)
 
     def _size(self) -> tuple[int, int]:

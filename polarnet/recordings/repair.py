@@ -20,7 +20,7 @@ LATE_US = 10_000
 PAUSE_US = 1_000_000  # longer pauses are counted
 FEW = 8  # events: at least as many must follow on a clock before it is believed
 MAX_RUN = 1000  # consecutive events with wrong times; a clock that shows another time for longer was set anew
-MAX_STALE = 100  # events that a camera may still hold from its last run
+MAX_STALE = 100  # events that a camera may still hold from its last run; `FEW` if the clock then jumps ahead
 MAX_HELD = 2**22  # events held back to wait for late ones
 TOLERATED_SHARE = 0.01  # accepted share of a file's events, per kind of damage
 TOLERATED_COUNT = 8  # accepted count in files too short for a share
@@ -135,15 +135,17 @@ class Clock:
             rest = rest.rows(slice(judged, None))
             if not reset:
                 break
-            if not (self._settled or self._judged > MAX_STALE):
+            ahead = rest.t[0] > (self._newest or 0)
+            if not self._settled and self._judged <= (FEW if ahead else MAX_STALE):
                 self.counts["stale"] += sum(len(one.t) for one in accepted)
                 accepted, self._newest = [NOTHING], None
             elif self._live:
                 rest = self._set_anew(rest)
-            elif rest.t[0] > (self._newest or 0):
+            elif ahead:
                 self.counts["pauses"] += 1
                 self._newest = int(rest.t[0])
             else:
+                self._settled = True
                 yield self._ready(_joined(accepted), final=True)
                 raise RecordingError(self._refusal(rest))
         self._unjudged = rest

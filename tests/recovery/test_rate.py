@@ -7,7 +7,7 @@ from polarnet.events.stream import slice_time
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.between import BetweenConfig
 from polarnet.methods.method import Recoverer
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.rate import Rate, check_rate, frames_at_rate
 from polarnet.recovery.stream import Input, frames_of
 from polarnet.stokes import Prediction
@@ -40,7 +40,7 @@ def source_of(channels, ends=(DURATION_US,)):
         Piece([slice_time(one, start, stop) for one in channels], stop, 0.0)
         for start, stop in zip(starts, ends, strict=True)
     ]
-    return Input("events", HEIGHT, WIDTH, pieces, ends[-1])
+    return Input("events", HEIGHT, WIDTH, pieces)
 
 
 def at_rate(hz, channels, rule=WINDOWS, ends=(DURATION_US,)):
