@@ -14,9 +14,9 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.recording import RecordingReader, open_recording
 from polarnet.recordings.repair import MAX_TIME
+from polarnet.recordings.writers import FORMS, export_store
 from polarnet.runtime.files import replaced
 from polarnet.storage.events import EventStore
-from polarnet.recordings.writers import FORMS, export_store
 
 SUFFIXES = {".h5": "hdf5", ".hdf5": "hdf5", ".txt": "text", ".raw": "evt3"}
 
@@ -53,9 +53,9 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
         FORMS[form][1](temporary, span.chunks(reader), None)
-    print(
-        f"{file} ({reader.format}) -> {options.out} ({form}): {span.count:,} events, time 0 is {span.origin_us} us"
-    )
+        if start_us and not span.count:
+            raise ValueError(f"{file.name}: expected events between --start and --stop, there are none; leave them out")
+    print(f"{file} ({reader.format}) -> {options.out} ({form}): {span.count:,} events, time 0 is {span.origin_us} us")
     for kind, count in reader.repairs.items():
         if count:
             print(f"repaired {kind}: {count}")

@@ -125,9 +125,7 @@ def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[
         heads = [rest if len(rest) else next(stream, nothing) for rest, stream in zip(rests, streams, strict=True)]
 
 
-def read_four(
-    files: Mapping[int, str | os.PathLike[str]], start_us: Mapping[int, int] | None = None
-) -> list[Events]:
+def read_four(files: Mapping[int, str | os.PathLike[str]], start_us: Mapping[int, int] | None = None) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
     Angles are in degrees and count modulo 180. `start_us` gives the start of the common clock in each file's own clock;

@@ -20,6 +20,7 @@ from polarnet.terminal.progress import ProgressBar
 
 HDF5_CHUNK = 2**16  # events
 BLOCK = 2**18  # events converted at once
+READ_EVENTS = 2**20  # events read at once from a store
 EVT3_MAX_SIDE = 2**11  # x and y have 11 bits
 EVT3_WORDS = 2**20  # 16-bit words written at once
 MAX_TEXT_US = 10**18  # seconds of 12 digits
@@ -227,8 +228,9 @@ def export_store(
             raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
         duration_us = store.duration_us(sequence)
         (folder / sequence).mkdir(parents=True, exist_ok=True)
-        for angle, events in zip(POLARIZER_ANGLES_DEG, store.read(sequence), strict=True):
-            write(folder / sequence / f"polarizer_{angle:03d}{suffix}", events, duration_us)
+        for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
+            path = folder / sequence / f"polarizer_{angle:03d}{suffix}"
+            write(path, _chunks(store, sequence, channel), duration_us)
     contents = {
         "form": form,
         "height": store.height,
@@ -239,6 +241,16 @@ def export_store(
         "attributes": store.attributes,
     }
     (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+
+
+def _chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
+    """The events of one channel, in chunks that begin with an empty one."""
+    yield Events.empty(store.height, store.width)
+    first, end = store.record(sequence)["offsets"][channel : channel + 2]
+    for start in range(first, end, READ_EVENTS):
+        spans = [(name, start, min(start + READ_EVENTS, end)) for name in "txyp"]
+        t, x, y, p = store.read_columns(sequence, spans)
+        yield Events.from_columns(t, x, y, p, store.height, store.width)
 
 
 def h5py_module() -> Any:

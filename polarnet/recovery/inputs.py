@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import calibrate_targets, import_targets
@@ -119,16 +120,15 @@ def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cle
     repairs = {reader.path.name: reader.repairs for reader in channels.readers}
     pieces = channels if clean is None else clean.clean(channels)
     height, width = size or (channels.height, channels.width)
-    pieces = pieces if size is None else _reduced(pieces, height, width)
+    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
     return Input(name, height, width, pieces, repairs, channels.number)
 
 
-def _reduced(pieces: Iterable[Piece], height: int, width: int) -> Iterator[Piece]:
-    """Pieces of fewer pixels."""
-    sums = np.zeros((len(POLARIZER_ANGLES_DEG), height, width))
+def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
+    """Pieces with the fewer pixels of `sums`, see `downscale`."""
     for piece in pieces:
-        coarse = [downscale(e, height, width, keep_rate=True, sums=own) for e, own in zip(piece.channels, sums)]
-        yield piece._replace(channels=coarse)
+        both = zip(piece.channels, sums, strict=True)
+        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
 
 
 def _channels(files: Files, work: Path) -> Channels:

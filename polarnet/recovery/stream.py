@@ -49,7 +49,7 @@ class Input(NamedTuple):
     channels: int = 4
     """4, or 1 for a camera behind a rotating polarizer or none."""
     live: bool = False
-    """Whether each frame is wanted as soon as its last event has arrived; else windows gather to be predicted faster."""
+    """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
 
 
 class Frame(NamedTuple):
@@ -166,7 +166,7 @@ def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWin
 def recover(
     source: Input, rule: WindowRule, words: str, writer: RecoveryWriter, frames: Iterable[Frame]
 ) -> dict[str, str]:
-    """Write all frames of the method that `words` describe, with a progress bar; facts for the page and the terminal."""
+    """Write all frames of the method that `words` describe; returns facts for the page and the terminal."""
     step_ms, latency_ms = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
     last_us, started = 0, time.perf_counter()
     with writer, ProgressBar(desc="recover", unit_scale=1e-6, bar_format=BAR) as bar:

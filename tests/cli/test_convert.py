@@ -38,6 +38,8 @@ def test_a_span_is_half_open_and_counts_from_the_first_event(recording, tmp_path
     assert "2 events, time 0 is 1250000 us" in capsys.readouterr().out
     assert main(["convert", str(recording), str(out), "--start", "1s", "--stop", "500ms"]) == 1
     assert "expected --stop after --start, got 1000000 to 500000 us" in capsys.readouterr().err
+    assert main(["convert", str(recording), str(out), "--start", "1s"]) == 1
+    assert "expected events between --start and --stop, there are none" in capsys.readouterr().err
     assert read_recording(out).events.t.tolist() == [0, 250_000]
 
 

@@ -10,8 +10,8 @@ import torch
 
 from polarnet.events.stream import slice_count
 from polarnet.recordings.recording import read_recording
-from polarnet.storage.events import EventStore
 from polarnet.recordings.writers import export_store, write_evt3, write_hdf5, write_text
+from polarnet.storage.events import EventStore
 
 HEIGHT, WIDTH = 12, 18
 
