@@ -7,7 +7,7 @@ from jaxtyping import Float, Int64, UInt8
 
 from polarnet.events.stream import Events
 from polarnet.networks.e2p.network import MOSAIC
-from polarnet.storage.exchange import h5py_module
+from polarnet.recordings.writers import h5py_module
 
 WHITE = 255
 

@@ -27,11 +27,11 @@ from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
+from polarnet.recordings.writers import write_hdf5
 from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, recording_picture
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
-from polarnet.storage.exchange import write_hdf5
 from polarnet.storage.frames import FrameStore
 from studies.simulated_rig import RigConfig, RigTruth, spread_us, true_dolp, write_rig
 from studies.simulation_pictures import few_colours

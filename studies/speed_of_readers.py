@@ -22,7 +22,7 @@ import psutil
 from polarnet.events.stream import Events
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.recording import open_recording
-from polarnet.storage.exchange import write_hdf5
+from polarnet.recordings.writers import write_hdf5
 from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, read_results, write_section
 
 PART = 1_000_000  # events that are written at a time, and microseconds that they take

@@ -12,7 +12,7 @@ from polarnet.captures.alignment import MAX_PICTURES, Lag, best_lag, logarithms,
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import TRAINED_WINDOW_US
-from polarnet.recordings.arrangements import shifted
+from polarnet.recordings.arrangements import Piece, shifted
 from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
 from polarnet.recordings.recording import Recording, detect_format, read_recording
@@ -97,10 +97,10 @@ def read_recorded(
     notes = [f"{name}: {note}" for note in clock_notes(truth.t_us, frame_lag(events, truth))]
     start_us, stop_us = int(truth.t_us[0]), int(truth.t_us[-1])
     cleaner = Cleaner(cleaning, mosaic)
-    channels = cleaner(split_mosaic(events, mosaic), last_us - first_us)
+    (piece,) = cleaner.clean([Piece(split_mosaic(events, mosaic), last_us - first_us, 0.0)])
     if any(cleaner.removed.values()):
         notes.append(f"{name}: removed {cleaner.sentence()}, of {len(events):,}.")
-    channels = [shifted(slice_time(one, start_us, stop_us), start_us) for one in channels]
+    channels = [shifted(slice_time(one, start_us, stop_us), start_us) for one in piece.channels]
     return Recorded(name, channels, truth._replace(t_us=truth.t_us - start_us), notes)
 
 

@@ -1,20 +1,22 @@
 """Commands that write files for other tools: convert, onnx."""
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
 from polarnet.cli.options import READING, duration_us, given, reading_of
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.stores import is_store
-from polarnet.events.stream import slice_time
+from polarnet.events.stream import Events, slice_time
 from polarnet.networks.onnx_export import TOLERANCE, export_network
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import shifted
-from polarnet.recordings.recording import read_recording
+from polarnet.recordings.recording import RecordingReader, open_recording
+from polarnet.recordings.repair import MAX_TIME
+from polarnet.recordings.writers import FORMS, export_store
 from polarnet.runtime.files import replaced
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import FORMS, export_store
 
 SUFFIXES = {".h5": "hdf5", ".hdf5": "hdf5", ".txt": "text", ".raw": "evt3"}
 
@@ -45,21 +47,40 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     if options.out.exists() and options.out.samefile(file):
         raise ValueError(f"{options.out}: expected another file than the one to convert; name another")
     start_us, stop_us = duration_us(options, "start", "500ms") or 0, duration_us(options, "stop", "500ms")
-    recording = read_recording(file, part=options.part, **reading_of(options))
-    events = recording.events
-    origin_us, last_us = (int(events.t[0]), int(events.t[-1])) if len(events) else (0, 0)
-    stop_us = last_us - origin_us + 1 if stop_us is None else stop_us
-    if stop_us <= start_us:
-        raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us of {last_us - origin_us} us")
-    part = shifted(slice_time(events, origin_us + start_us, origin_us + stop_us), origin_us + start_us)
+    if stop_us is not None and stop_us <= start_us:
+        raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us")
+    reader = open_recording(file, part=options.part, **reading_of(options))
+    span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
-        FORMS[form][1](temporary, part, max(0, min(stop_us, last_us - origin_us + 1) - start_us))
-    print(
-        f"{file} ({recording.format}) -> {options.out} ({form}): {len(part):,} of {len(events):,} events, "
-        f"time 0 is {origin_us + start_us} us"
-    )
-    for kind, count in recording.repairs.items():
-        print(f"repaired {kind}: {count}")
+        FORMS[form][1](temporary, span.chunks(reader), None)
+        if start_us and not span.count:
+            raise ValueError(f"{file.name}: expected events between --start and --stop, there are none; leave them out")
+    print(f"{file} ({reader.format}) -> {options.out} ({form}): {span.count:,} events, time 0 is {span.origin_us} us")
+    for kind, count in reader.repairs.items():
+        if count:
+            print(f"repaired {kind}: {count}")
+
+
+class _Span:
+    """A span of time after a recording's first event, read no further than its end."""
+
+    def __init__(self, start_us: int, stop_us: int | None):
+        self.count = self.origin_us = 0
+        self._start_us, self._stop_us = start_us, stop_us
+
+    def chunks(self, reader: RecordingReader) -> Iterator[Events]:
+        """Its events, in chunks, the first of which may be empty; times count from its start."""
+        yield Events.empty(reader.height, reader.width)
+        first_us = None
+        for chunk in reader:
+            first_us = int(chunk.t[0]) if first_us is None else first_us
+            self.origin_us = first_us + self._start_us
+            stop_us = MAX_TIME if self._stop_us is None else first_us + self._stop_us
+            part = shifted(slice_time(chunk, self.origin_us, stop_us), self.origin_us)
+            self.count += len(part)
+            yield part
+            if chunk.t[-1] >= stop_us:
+                return
 
 
 def onnx(options: argparse.Namespace) -> None:

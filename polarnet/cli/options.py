@@ -31,8 +31,13 @@ def cleaning_of(options: argparse.Namespace) -> Cleaning:
 def duration_us(options: argparse.Namespace, name: str, example: str) -> int | None:
     """Option --NAME as a time in microseconds; None if it is not given, ValueError for anything but a time."""
     text = getattr(options, name)
-    time_us, _ = parse_window(text) if text else (None, None)
-    if text and time_us is None:
+    if not text:
+        return None
+    try:
+        time_us, _ = parse_window(text)
+    except ValueError:
+        time_us = None
+    if time_us is None:
         raise ValueError(f"--{name}: expected a time such as {example}, got {text}")
     return time_us
 

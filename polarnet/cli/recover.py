@@ -16,7 +16,9 @@ from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
-from polarnet.recordings.recording import detect_format, read_recording
+from polarnet.recordings.recording import detect_format, open_recording
+from polarnet.recordings.repair import HARMLESS
+from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
 from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
@@ -74,8 +76,9 @@ def run(options: argparse.Namespace) -> None:
         if given(options, CLEANING):
             facts["removed"] = cleaner.sentence()
         notes = check.findings() if check else []
-        if left_out := {kind: count for kind, count in (source.left_out or {}).items() if count}:
-            notes.append(f"Unusable lines were left out: {left_out}.")
+        for name, repairs in source.repairs.items():
+            damage = ((kind, count) for kind, count in repairs.items() if count and kind not in HARMLESS)
+            notes += [f"{name}: {count:,} {REPAIRS[kind]}." for kind, count in damage]
         page = writer.write_page(source.name, facts, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")
@@ -90,21 +93,20 @@ def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | Non
     if options.rotating is None and options.triggers is None:
         return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
-    read = functools.partial(read_recording, **reading_of(options))
-    source, rotation = open_rotating(Path(options.input[0]), rotation, read, options.size)
+    open_file = functools.partial(open_recording, **reading_of(options))
+    source, rotation = open_rotating(Path(options.input[0]), rotation, open_file, options.size)
     return source, rotation, half_turn_rule(rotation, step_us)
 
 
 def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner, work: Path, config: Config) -> Input:
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
-        source = open_live(options.input[0], mosaic, options.idle)
-        return source._replace(pieces=cleaner.live(source.pieces))
+        return open_live(options.input[0], mosaic, options.idle, cleaner)
     method = METHODS.get(options.method)
     plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
-    read = functools.partial(read_recording, **reading_of(options))
+    open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
-    files = Files(paths, options.angles, mosaic, options.sequence, plain, read, config.recordings)
+    files = Files(paths, options.angles, mosaic, options.sequence, plain, open_file, config.recordings)
     return open_files(files, work, options.size, cleaner)
 
 

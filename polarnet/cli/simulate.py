@@ -20,12 +20,12 @@ from polarnet.config.tree import Config, load
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.clips import TIMES_FILE, Clip, ClipFrame, ClipOptions, check_times, open_clip, times_from_file
 from polarnet.pictures.images import fit
+from polarnet.recordings.writers import h5py_module
 from polarnet.runtime.machine import configure, threads_of
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.scene import PolarizationScene, scene_from_intensities, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import parse_mosaic
-from polarnet.storage.exchange import h5py_module
 
 PHOTOGRAPH = "astronaut"
 

@@ -14,12 +14,12 @@ from polarnet import stokes
 from polarnet.clips.video import Piece
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
+from polarnet.recordings.writers import FORMS
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import write_true_video
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.events import MAX_DURATION_US, EventStore
-from polarnet.storage.exchange import FORMS
 from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.true_frames import APPENDED, open_truth

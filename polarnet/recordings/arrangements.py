@@ -1,4 +1,4 @@
-"""Turn files of any polarizer arrangement into four channels on one clock.
+"""Turn files of any polarizer arrangement into four channels on one clock, whole or in pieces of constant memory.
 
 An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
 file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets`
@@ -6,28 +6,131 @@ handles division-of-time captures.
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, select
-from polarnet.recordings.recording import Recording, read_recording
+from polarnet.events.stream import Events, concatenate, select, slice_count
+from polarnet.recordings.recording import Recording, RecordingReader, log_repairs, open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
+Open = Callable[[Path], RecordingReader]
+"""`open_recording`, with options where a file needs some."""
 
-def read_four(
+
+class Piece(NamedTuple):
+    """The events of all channels that follow those of the previous piece."""
+
+    channels: Sequence[Events]
+    """Times count from the first event of the input."""
+    until_us: int
+    """Every later piece holds only events at or after this time."""
+    read_at: float
+    """When its first data arrived, by `time.perf_counter`."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Channels of one size, in pieces; each iteration starts from the beginning.
+
+    RecordingError while iterating, where a file turns out to be damaged.
+    """
+
+    height: int
+    width: int
+    blocks: Callable[[], Iterator[Sequence[Events]]]
+    """The events of all channels in blocks, each with no event before the last one of the previous block."""
+    readers: Sequence[RecordingReader] = ()
+    """Files behind the channels, whose `repairs` are complete after an iteration."""
+    origin_us: int | None = None
+    """Time 0 by the clock of `blocks`; None: their first event."""
+    number: int = len(POLARIZER_ANGLES_DEG)
+
+    def __iter__(self) -> Iterator[Piece]:
+        piece = None
+        for piece in pieces_of(((block, time.perf_counter()) for block in self.blocks()), self.origin_us):
+            yield piece
+        if piece is not None:  # the end of the input completes the time of the last event
+            nothing = [slice_count(events, 0, 0) for events in piece.channels]
+            yield Piece(nothing, piece.until_us + 1, time.perf_counter())
+
+    def whole(self) -> list[Events]:
+        """All events; logs a warning for each kind of damage."""
+        pieces = [piece.channels for piece in self]
+        for reader in self.readers:
+            log_repairs(reader)
+        if not pieces:
+            return [Events.empty(self.height, self.width)] * self.number
+        return [concatenate(channel) for channel in zip(*pieces, strict=True)]
+
+
+def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int | None = None) -> Iterator[Piece]:
+    """Pieces of blocks of channels and their times of arrival; time 0 is `origin_us` (None: the first event)."""
+    until_us = 0
+    for channels, read_at in blocks:
+        filled = [events.t for events in channels if len(events)]
+        if filled:
+            origin_us = min(int(t[0]) for t in filled) if origin_us is None else origin_us
+            until_us = max(until_us, *(int(t[-1]) - origin_us for t in filled))
+            yield Piece([shifted(events, origin_us) for events in channels], until_us, read_at)
+
+
+def open_four(
     files: Mapping[int, str | os.PathLike[str]],
     start_us: Mapping[int, int] | None = None,
-    read: Callable[[Path], Recording] = read_recording,
-) -> list[Events]:
+    open_file: Open = open_recording,
+) -> Channels:
+    """The channels of `read_four`, in pieces."""
+    by_angle = {angle % 180: angle for angle in files}
+    if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
+        raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
+    if start_us is not None and set(start_us) != set(files):
+        raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
+    angles = [by_angle[angle] for angle in POLARIZER_ANGLES_DEG]
+    readers = [open_file(Path(files[angle])) for angle in angles]
+    sizes = {(reader.height, reader.width) for reader in readers}
+    if len(sizes) > 1:
+        raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
+    nothing = Events.empty(*sizes.pop())
+    if start_us is None:
+        return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers)
+    starts = [start_us[angle] for angle in angles]
+    return Channels(
+        nothing.height, nothing.width, lambda: _together(map(_from, readers, starts), nothing), readers, origin_us=0
+    )
+
+
+def _from(chunks: Iterable[Events], start_us: int) -> Iterator[Events]:
+    """The events from a time on, which becomes time 0."""
+    for events in chunks:
+        if len(later := select(events, events.t >= start_us)):
+            yield shifted(later, start_us)
+
+
+def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[list[Events]]:
+    """Blocks of streams on one clock: each ends with the chunk that ends first, and the next one of it is read."""
+    streams = list(streams)
+    heads = [next(stream, nothing) for stream in streams]
+    while any(map(len, heads)):
+        until_us = min(int(head.t[-1]) for head in heads if len(head))
+        places = [int(np.searchsorted(head.t.numpy(), until_us, side="right")) for head in heads]
+        yield [slice_count(head, 0, place) for head, place in zip(heads, places, strict=True)]
+        rests = [slice_count(head, place, len(head)) for head, place in zip(heads, places, strict=True)]
+        heads = [rest if len(rest) else next(stream, nothing) for rest, stream in zip(rests, streams, strict=True)]
+
+
+def read_four(files: Mapping[int, str | os.PathLike[str]], start_us: Mapping[int, int] | None = None) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
     Angles are in degrees and count modulo 180. `start_us` gives the start of the common clock in each file's own clock;
     earlier events are left out. Without it the files share one clock, whose time 0 is the earliest of all events.
-    `read` replaces `read_recording` where a file needs options. RecordingError where an angle is missing or duplicated,
-    or where the sensor sizes differ.
+    RecordingError where an angle is missing or duplicated, or where the sensor sizes differ.
 
     >>> from pathlib import Path
     >>> from polarnet.recordings import read_four
@@ -35,24 +138,19 @@ def read_four(
     >>> [len(channel) for channel in read_four(dict.fromkeys((0, 45, 90, 135), "night.txt"))]
     [1, 1, 1, 1]
     """
-    by_angle = {angle % 180: angle for angle in files}
-    if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
-        raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
-    if start_us is not None and set(start_us) != set(files):
-        raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
-    channels = [read(Path(files[by_angle[angle]])).events for angle in POLARIZER_ANGLES_DEG]
-    sizes = {(channel.height, channel.width) for channel in channels}
-    if len(sizes) > 1:
-        raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
-    if start_us is None:
-        return _from_first_event(channels)
-    starts = [start_us[by_angle[angle]] for angle in POLARIZER_ANGLES_DEG]
-    return [shifted(select(c, c.t >= start), start) for c, start in zip(channels, starts, strict=True)]
+    return open_four(files, start_us).whole()
 
 
-def read_mosaic(
-    path: str | os.PathLike[str], mosaic: Mosaic, read: Callable[[Path], Recording] = read_recording
-) -> list[Events]:
+def open_mosaic(path: str | os.PathLike[str], mosaic: Mosaic, open_file: Open = open_recording) -> Channels:
+    """The channels of `read_mosaic`, in pieces."""
+    reader = open_file(Path(path))
+    channel = split_mosaic(Events.empty(reader.height, reader.width), mosaic)[0]
+    return Channels(
+        channel.height, channel.width, lambda: (split_mosaic(events, mosaic) for events in reader), [reader]
+    )
+
+
+def read_mosaic(path: str | os.PathLike[str], mosaic: Mosaic) -> list[Events]:
     """The four channels (0, 45, 90, 135 degrees) of a file of a camera with a mosaic; time 0 is its first event.
 
     >>> from pathlib import Path
@@ -61,20 +159,21 @@ def read_mosaic(
     >>> [len(channel) for channel in read_mosaic("night.txt", ((90, 45), (135, 0)))]
     [0, 1, 0, 0]
     """
-    return _from_first_event(split_mosaic(read(Path(path)).events, mosaic))
+    return open_mosaic(path, mosaic).whole()
+
+
+def open_plain(path: Path, open_file: Open = open_recording) -> Channels:
+    """One channel in pieces: all events of a camera without polarizers."""
+    reader = open_file(path)
+    return Channels(reader.height, reader.width, lambda: ([events] for events in reader), [reader], number=1)
 
 
 def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
     """One channel: all events of a camera without polarizers; time starts with its first event."""
-    return _from_first_event([read(path).events])
+    events = read(path).events
+    return [shifted(events, int(events.t[0])) if len(events) else events]
 
 
 def shifted(events: Events, origin_us: int) -> Events:
     """The same events, with `origin_us` as time 0."""
     return replace(events, t=events.t - origin_us)
-
-
-def _from_first_event(channels: Sequence[Events]) -> list[Events]:
-    """The channels, with time 0 at the earliest event of any of them."""
-    start_us = min((int(channel.t[0]) for channel in channels if len(channel)), default=0)
-    return [shifted(channel, start_us) for channel in channels]

@@ -17,78 +17,81 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from queue import Queue
+from queue import Empty, Queue
 from threading import Thread
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
+import torch
 from jaxtyping import Int64
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import MAX_SIDE, Events
+from polarnet.recordings.arrangements import Piece, pieces_of
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
-from polarnet.recordings.repair import refuse_much_damage, usable
-from polarnet.recordings.source import Block, RecordingError
+from polarnet.recordings.repair import Clock, refuse_much_damage, usable
+from polarnet.recordings.source import SAFE, Block, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.terminal.installation import installation
 
 READ_BYTES = 2**20
 MAX_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
 POLL_S = 0.001
+MAX_WAIT_S = 0.02  # events whose times later ones must confirm wait no longer, unless later ones have arrived
 SCHEME, CAMERA = "dv://", "camera"
 NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")
 
 
-class Piece(NamedTuple):
-    """The events that arrived since the previous piece."""
-
-    channels: Sequence[Events]
-    """Four channels; times count from the first event of the stream."""
-    until_us: int
-    """Every later piece holds only events at or after this time."""
-    read_at: float
-    """When its first data arrived, by `time.perf_counter`."""
-
-
 class _Stream:
-    """Makes pieces of rows `t x y p` of a mosaic, or `t x y p angle`; events older than an earlier piece are late."""
+    """Makes blocks of four channels from the events of a mosaic, or of four sensors, as they arrive."""
 
-    def __init__(self, height: int, width: int, mosaic: Mosaic | None):
+    def __init__(self, name: str, height: int, width: int, mosaic: Mosaic | None):
         self.height, self.width = (side // 2 if mosaic else side for side in (height, width))
         self.counts: Counter[str] = Counter()
         self._sensor, self._mosaic = (height, width), mosaic
-        self._origin_us: int | None = None
-        self._until_us = 0
+        self._clock = Clock(name, self.counts, live=True)
+        self._since = 0.0
 
-    def pieces(self, table: Int64[np.ndarray, "n columns"], read_at: float) -> Iterator[Piece]:
-        """The piece of the next rows; none if all of them are late."""
-        if not len(table):
-            return
-        table = table[np.argsort(table[:, 0], kind="stable")]
-        self._origin_us = int(table[0, 0]) if self._origin_us is None else self._origin_us
-        table = np.column_stack([table[:, 0] - self._origin_us, table[:, 1:]])
-        current = table[table[:, 0] >= self._until_us]
-        self.counts["late"] += len(table) - len(current)
-        if len(current):
-            self._until_us = int(current[-1, 0])
-            yield Piece(self._channels(current), self._until_us, read_at)
+    def patience_s(self) -> float | None:
+        """Seconds until the events that are held back are to be flushed; None if there are none."""
+        return max(0.0, self._since + MAX_WAIT_S - time.perf_counter()) if self._clock.waiting else None
 
-    def _channels(self, table: Int64[np.ndarray, "n columns"]) -> list[Events]:
+    def add(
+        self, table: Int64[np.ndarray, "n columns"], read_at: float, *, flush: bool = False
+    ) -> Iterator[tuple[list[Events], float]]:
+        """Channels of the next rows `t x y p` or `t x y p angle`, and the time of arrival of the first of them."""
+        self._since = self._since if self._clock.waiting else read_at
+        t, x, y, p, *angle = table.T
+        good = usable(Block(t, x, y, np.where(p == -1, 0, p)), *self._sensor, 0, self.counts)
+        p = np.where(p > 0, 1, -1)
+        if angle:
+            channel = np.searchsorted(POLARIZER_ANGLES_DEG[:-1], angle[0])
+            known = np.array(POLARIZER_ANGLES_DEG)[channel] == angle[0]
+            self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
+            good &= known
+            p *= 1 + channel  # the clock sorts the columns of `Block` alone, so p holds the channel too
+        x, y, p = (column[good].astype(dtype) for column, dtype in ((x, np.int16), (y, np.int16), (p, np.int8)))
+        for ready in self._clock.ordered(Block(t[good], x, y, p), final=flush):
+            if len(ready.t):
+                yield self._channels(ready), self._since
+
+    def _channels(self, block: Block) -> list[Events]:
         if self._mosaic:
-            return split_mosaic(self._events(table), self._mosaic)
-        return [self._events(table[table[:, 4] == angle]) for angle in POLARIZER_ANGLES_DEG]
+            return split_mosaic(self._events(block), self._mosaic)
+        channel = np.abs(block.p)
+        return [self._events(block.rows(channel == 1 + k)) for k in range(len(POLARIZER_ANGLES_DEG))]
 
-    def _events(self, table: Int64[np.ndarray, "n columns"]) -> Events:
-        t, x, y, p = table[:, :4].T
-        return Events.from_columns(t, x, y, np.where(p > 0, 1, -1), *self._sensor)
+    def _events(self, block: Block) -> Events:
+        t, x, y, p = map(torch.from_numpy, block)
+        return Events(t, x, y, p.sign(), *self._sensor)
 
 
 class LiveLines:
     """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
 
-    Unusable lines, and late ones, which are older than an event of an earlier piece, are left out and counted in
-    `counts`. RecordingError where more than 1 % of the lines (and 8) are unusable for the same reason, or where the
-    first line is not a size. The source is closed at its end, unless it is standard input.
+    Unusable lines and events with wrong times are left out and counted in `counts`. RecordingError where more than 1 %
+    of the lines (and 8) are unusable for the same reason, or where the first line is not a size. The source is closed
+    at its end, unless it is standard input.
     """
 
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
@@ -98,44 +101,55 @@ class LiveLines:
         self._queue: Queue[tuple[bytes, float] | None] = Queue(MAX_READ_AHEAD if self._grows else 0)
         own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
-        self._blocks = self._whole_lines()
-        self._sensor = self._first_line()
-        self._stream = _Stream(*self._sensor, mosaic)
+        self._stream: _Stream | None = None
+        self._lines = self._whole_lines()
+        self._sensor = self._size()
+        self._stream = _Stream(name, *self._sensor, mosaic)
         self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
 
     def __iter__(self) -> Iterator[Piece]:
+        return pieces_of(self._blocks())
+
+    def _blocks(self) -> Iterator[tuple[list[Events], float]]:
+        assert self._stream is not None
         shift, lines = np.zeros(self._columns, np.int64), 0
-        for data, read_at in self._blocks:
-            rows = [np.empty((0, self._columns), np.int64), *rows_of(data, shift, self.counts, "unreadable_lines")]
-            table = self._usable(np.concatenate(rows))
+        nothing = np.empty((0, self._columns), np.int64)
+        for data, read_at in self._lines:
+            rows = [nothing, *rows_of(data, shift, self.counts, "unreadable_lines")]
             lines += data.count(b"\n")
-            refuse_much_damage(self.name, self.counts, lines)
-            yield from self._stream.pieces(table, read_at)
+            blocks = list(self._stream.add(np.concatenate(rows), read_at, flush=not data))
+            refuse_much_damage(self.name, self.counts, lines, (*SAFE, "time_glitches"))
+            yield from blocks
+        yield from self._stream.add(nothing, 0.0, flush=True)
 
-    def _usable(self, table: Int64[np.ndarray, "n columns"]) -> Int64[np.ndarray, "m columns"]:
-        t, x, y, p, *angle = table.T
-        good = usable(Block(t, x, y, np.where(p == -1, 0, p)), *self._sensor, 0, self.counts)
-        if angle:
-            known = np.isin(angle[0], POLARIZER_ANGLES_DEG)
-            self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
-            good &= known
-        return table[good]
-
-    def _first_line(self) -> tuple[int, int]:
-        """Height and width; the rest of what has arrived stays in `_blocks`."""
-        data, read_at = next(self._blocks, (b"", 0.0))
-        line, _, rest = data.partition(b"\n")
+    def _size(self) -> tuple[int, int]:
+        """Height and width in the first line that is no comment; what has arrived after it stays in `_lines`."""
+        line = b""
+        while not line.partition(b"#")[0].strip():
+            data, read_at = next(self._lines, (b"", 0.0))
+            if not data:
+                break
+            line, _, rest = data.partition(b"\n")
+            self._lines = itertools.chain([(rest, read_at)] if rest else [], self._lines)
         words = [word for one in numbers_of(line) for word in one.words]
         if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
             raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
-        if rest:
-            self._blocks = itertools.chain([(rest, read_at)], self._blocks)
         return int(words[1]), int(words[0])
 
     def _whole_lines(self) -> Iterator[tuple[bytes, float]]:
-        """Complete lines with their time of arrival; at the end of the input, also an incomplete last line."""
+        """Complete lines with their time of arrival, none where events were held back for long enough.
+
+        At the end of the input, also an incomplete last line.
+        """
         rest, read_at = b"", 0.0
-        while (arrived := self._queue.get()) is not None:
+        while True:
+            try:
+                arrived = self._queue.get(timeout=self._stream.patience_s() if self._stream else None)
+            except Empty:
+                yield b"", time.perf_counter()
+                continue
+            if arrived is None:
+                break
             data, read_at = arrived
             while len(data) < READ_BYTES and not self._queue.empty():  # data already waiting joins this piece
                 if (more := self._queue.get()) is None:
@@ -173,8 +187,8 @@ class LiveLines:
 class LiveCamera:
     """Events of a camera in pieces, as they arrive; ends with the connection, or after `idle_s` without an event.
 
-    Events older than the last one of an earlier piece are left out and counted in `counts`. RuntimeError where
-    dv-processing is missing; RecordingError where the camera or program cannot be reached.
+    Events with wrong times are left out and counted in `counts`. RuntimeError where dv-processing is missing;
+    RecordingError where the camera or program cannot be reached.
     """
 
     def __init__(self, address: str, mosaic: Mosaic, idle_s: float):
@@ -182,22 +196,28 @@ class LiveCamera:
         self._idle_s = idle_s
         self._reader = _opened(address)
         width, height = self._reader.getEventResolution()
-        self._stream = _Stream(height, width, mosaic)
+        self._stream = _Stream(address, height, width, mosaic)
         self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
 
     def __iter__(self) -> Iterator[Piece]:
-        quiet_since = time.monotonic()
+        return pieces_of(self._blocks())
+
+    def _blocks(self) -> Iterator[tuple[list[Events], float]]:
+        nothing, quiet_since = np.empty((0, 4), np.int64), time.monotonic()
         while time.monotonic() - quiet_since < self._idle_s:
             batch = self._reader.getNextEventBatch()
             if batch is not None and not batch.isEmpty():
                 read_at, quiet_since = time.perf_counter(), time.monotonic()
                 columns = batch.timestamps(), batch.coordinates(), batch.polarities()
                 table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
-                yield from self._stream.pieces(table, read_at)
+                yield from self._stream.add(table, read_at)
+            elif self._stream.patience_s() == 0:
+                yield from self._stream.add(nothing, 0.0, flush=True)
             elif self._reader.isRunning():
                 time.sleep(POLL_S)
             else:
-                return
+                break
+        yield from self._stream.add(nothing, 0.0, flush=True)
 
 
 def _opened(address: str) -> Any:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, select
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.stokes import Mosaic
 
 FOUND = "found"
@@ -42,39 +42,35 @@ class Cleaner:
     """Removes noise from the pieces of a recording; `removed` counts the events, `hot` the hot pixels.
 
     `mosaic` is the arrangement of the sensor's polarizers, whose channels have half its rows and columns; None if each
-    channel has its own sensor. Found hot pixels need the whole recording in one piece: ValueError for live input.
+    channel has its own sensor.
     """
 
     def __init__(self, cleaning: Cleaning, mosaic: Mosaic | None):
         self.removed = {"hot pixels": 0, "background activity": 0}
         self.hot = 0
         self._cleaning, self._mosaic = cleaning, mosaic
-        self._bad: list[Bool[np.ndarray, "h w"]] | None = None
-        self._last: list[np.ndarray] = []
 
-    def __call__(self, channels: Sequence[Events], duration_us: int) -> list[Events]:
-        """The channels of a whole recording, or of its next piece, without noise."""
-        if self._bad is None:
-            self._bad = [self._hot(events, k, duration_us) for k, events in enumerate(channels)]
-            self._last = [never(events) for events in channels]
-            self.hot = sum(int(bad.sum()) for bad in self._bad)
-        clean = [without_pixels(events, bad) for events, bad in zip(channels, self._bad, strict=True)]
-        self.removed["hot pixels"] += sum(map(len, channels)) - sum(map(len, clean))
-        if self._cleaning.background_us is None:
-            return clean
-        quiet = [
-            without_background(events, self._cleaning.background_us, last)
-            for events, last in zip(clean, self._last, strict=True)
-        ]
-        self.removed["background activity"] += sum(map(len, clean)) - sum(map(len, quiet))
-        return quiet
-
-    def live(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
-        """Clean pieces as they arrive."""
-        if self._cleaning.hot == FOUND:
+    def clean(self, pieces: Iterable[Piece], *, live: bool = False) -> Iterator[Piece]:
+        """The pieces without noise. Hot pixels are found in a first pass over them: ValueError for live input."""
+        if live and self._cleaning.hot == FOUND:
             raise ValueError(f"--hot-pixels {FOUND}: expected a file of hot pixels for live input, `x y` a line")
+        return self._cleaned(pieces)
+
+    def _cleaned(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
+        bad = self._found(pieces) if self._cleaning.hot == FOUND else None
+        last: list[np.ndarray] = []
         for piece in pieces:
-            yield piece._replace(channels=self(piece.channels, piece.until_us))
+            if not last:
+                bad = bad or [self._listed(events, k) for k, events in enumerate(piece.channels)]
+                self.hot = sum(int(one.sum()) for one in bad)
+                last = [never(events) for events in piece.channels]
+            clean = list(map(without_pixels, piece.channels, bad or []))
+            self.removed["hot pixels"] += sum(map(len, piece.channels)) - sum(map(len, clean))
+            if (within_us := self._cleaning.background_us) is not None:
+                quiet = [without_background(events, within_us, one) for events, one in zip(clean, last, strict=True)]
+                self.removed["background activity"] += sum(map(len, clean)) - sum(map(len, quiet))
+                clean = quiet
+            yield piece._replace(channels=clean)
 
     def sentence(self) -> str:
         """Number of removed events of each kind, in words."""
@@ -83,11 +79,20 @@ class Cleaner:
             for kind, count in self.removed.items()
         )
 
-    def _hot(self, events: Events, channel: int, duration_us: int) -> Bool[np.ndarray, "h w"]:
+    def _found(self, pieces: Iterable[Piece]) -> list[Bool[np.ndarray, "h w"]]:
+        """Hot pixels of each channel of a whole recording; none if it has no event."""
+        counts: Sequence[np.ndarray] = []
+        duration_us = 0
+        for piece in pieces:
+            new = list(map(event_counts, piece.channels))
+            counts = list(map(np.add, counts, new)) if counts else new
+            duration_us = piece.until_us
+        return [hot_pixels(one, duration_us * 1e-6, self._cleaning.hot_factor) for one in counts]
+
+    def _listed(self, events: Events, channel: int) -> Bool[np.ndarray, "h w"]:
+        """Hot pixels of a channel in the user's list."""
         if self._cleaning.hot is None:
             return np.zeros((events.height, events.width), bool)
-        if self._cleaning.hot == FOUND:
-            return hot_pixels(event_counts(events), duration_us * 1e-6, self._cleaning.hot_factor)
         cell = 1 if self._mosaic is None else 2
         listed = read_hot_pixels(Path(self._cleaning.hot), cell * events.height, cell * events.width)
         if self._mosaic is None:

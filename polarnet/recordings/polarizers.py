@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 
 from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 

@@ -147,11 +147,16 @@ def read_recording(
     """
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
     chunks = list(reader)
-    for kind, count in reader.repairs.items():
-        if count and kind not in HARMLESS:
-            logger.warning("%s: %d %s", Path(path).name, count, REPAIRS[kind])
+    log_repairs(reader)
     events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
+
+
+def log_repairs(reader: RecordingReader) -> None:
+    """Log a warning for each kind of damage that the latest iteration of a reader repaired."""
+    for kind, count in reader.repairs.items():
+        if count and kind not in HARMLESS:
+            logger.warning("%s: %d %s", reader.path.name, count, REPAIRS[kind])
 
 
 def detect_format(path: str | os.PathLike[str]) -> str:
@@ -171,17 +176,22 @@ def detect_format(path: str | os.PathLike[str]) -> str:
 
 
 def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:
-    """The same events in blocks of `size`; the last block holds the remainder."""
+    """The same events in blocks of `size`; the last block holds the remainder, also before a RecordingError."""
     waiting: list[Block] = []
-    count = 0
-    for block in blocks:
-        waiting.append(block)
-        count += len(block.t)
-        if count >= size:
-            whole = joined(waiting)
-            for start in range(0, count - size + 1, size):
-                yield whole.rows(slice(start, start + size))
-            count %= size
-            waiting = [whole.rows(slice(len(whole.t) - count, None))]
+    count, refusal = 0, None
+    try:
+        for block in blocks:
+            waiting.append(block)
+            count += len(block.t)
+            if count >= size:
+                whole = joined(waiting)
+                for start in range(0, count - size + 1, size):
+                    yield whole.rows(slice(start, start + size))
+                count %= size
+                waiting = [whole.rows(slice(len(whole.t) - count, None))]
+    except RecordingError as error:
+        refusal = error
     if count:
         yield joined(waiting)
+    if refusal is not None:
+        raise refusal

@@ -1,40 +1,45 @@
-"""Repair a file's blocks: events end up in time order, on the sensor and of polarity +1 or -1, or the file is refused.
+"""Repair blocks of events: in time order, on the sensor and of polarity +1 or -1; or the file is refused.
 
-Every repair is counted. The outcome depends on the file alone, not on the block size.
+Every repair is counted. The outcome of a file depends on the file alone, not on the block size.
 """
 
+import logging
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import Bool
 
+from polarnet.events.streaming import MAX_PAUSE_US
 from polarnet.recordings.source import REPAIRS, SAFE, Block, RecordingError, Source, joined
 
 LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
 PAUSE_US = 1_000_000  # longer pauses are counted
-LOOKAHEAD = 8  # following events that distinguish a wrong time from a clock that was reset
+FEW = 8  # events: at least as many must follow on a clock before it is believed
+MAX_RUN = 1000  # consecutive events with wrong times; a clock that shows another time for longer was set anew
+MAX_STALE = 100  # events that a camera may still hold from its last run; `FEW` if the clock then jumps ahead
 MAX_HELD = 2**22  # events held back to wait for late ones
 TOLERATED_SHARE = 0.01  # accepted share of a file's events, per kind of damage
 TOLERATED_COUNT = 8  # accepted count in files too short for a share
 HARMLESS = ("no_change", "unsorted", "pauses")
-FIRST_PAUSE_US = 3_600_000_000  # a longer pause right after the first event means that the first event's time is wrong
 MAX_TIME = 2**60  # microseconds; differences still fit into int64
-
+NEVER, UNKNOWN = -1, -2
 
 NOTHING = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
+
+logger = logging.getLogger(__name__)
 
 
 def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]:
     """The events of a source, t as int64, x and y as int16, p as int8; repairs are added to `counts`.
 
-    RecordingError, beginning with `name`, where damage is not safe to repair: more than 1 % of the events (and 8) of
-    one kind, or a time that goes back by more than 10 ms and stays there.
+    RecordingError, beginning with `name`, where damage is not safe to repair, after the events before it: more than 1 %
+    of the events (and 8) of one kind, or a clock that was set anew.
     """
-    clock = _Clock(name)
+    clock = Clock(name, counts)
     darker: int | None = None
     events = 0
     for block in source.blocks(counts):
@@ -44,10 +49,12 @@ def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]
             if column.dtype.kind == "f" and not np.equal(column, np.floor(column)).all():
                 raise RecordingError(f"{name}: expected x and y to be whole numbers")
         good = usable(block, source.height, source.width, darker, counts)
-        yield clock.ordered(_typed(block if good.all() else block.rows(good)), counts, last=False)
+        for ready in clock.ordered(_typed(block if good.all() else block.rows(good))):
+            refuse_much_damage(name, counts, events)
+            yield ready
+    for ready in clock.ordered(NOTHING, final=True):
         refuse_much_damage(name, counts, events)
-    yield clock.ordered(NOTHING, counts, last=True)
-    refuse_much_damage(name, counts, events)
+        yield ready
     damage = {kind: count for kind, count in counts.items() if count and kind not in HARMLESS}
     if damage and events == 0:
         raise RecordingError(f"{name}: no event can be read in it: {damage}; is the format right?")
@@ -70,10 +77,10 @@ def usable(block: Block, height: int, width: int, darker: int | None, counts: Co
     return known & inside
 
 
-def refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
-    """RecordingError if more than 1 % of the events (and 8) have the same damage, unless it is `SAFE`."""
+def refuse_much_damage(name: str, counts: Counter[str], events: int, safe: Collection[str] = SAFE) -> None:
+    """RecordingError if more than 1 % of the events (and 8) have the same damage, unless it is `safe`."""
     for kind, words in REPAIRS.items():
-        if kind not in SAFE and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
+        if kind not in safe and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
             raise RecordingError(
                 f"{name}: {counts[kind]} among the first {events} events: {words.split(':')[0]}; "
                 f"so much damage is not repaired. Is the format right, and the size of the sensor?"
@@ -82,94 +89,190 @@ def refuse_much_damage(name: str, counts: Counter[str], events: int) -> None:
 
 def _typed(block: Block) -> Block:
     x, y = (column.astype(np.int16, copy=False) for column in (block.x, block.y))
-    return Block(block.t.astype(np.int64, copy=False), x, y, np.where(block.p == 1, np.int8(1), np.int8(-1)))
+    return Block(np.ascontiguousarray(block.t, np.int64), x, y, np.where(block.p == 1, np.int8(1), np.int8(-1)))
 
 
-class _Clock:
-    """Sorts late events into place, and holds back the last few events until their times can be judged."""
+def _joined(blocks: list[Block]) -> Block:
+    return joined([block for block in blocks if len(block.t)] or [NOTHING])
 
-    def __init__(self, name: str):
+
+class Clock:
+    """Puts events in time order and leaves out those with wrong times: the one rule for files and live input.
+
+    A time more than 10 ms before or after the newest one is judged by the events that follow it (docs/recordings.md has
+    the cases). Repairs are added to `counts`. A clock that was set anew ends a file with a RecordingError; `live` input
+    goes on as after a pause of 10 ms.
+    """
+
+    def __init__(self, name: str, counts: Counter[str], *, live: bool = False):
         self.name = name
-        self.judged = 0
-        self.newest: int | None = None
-        self.floor = -MAX_TIME
-        self.unjudged = self.held = NOTHING
+        self.counts = counts
+        self._live = live
+        self._settled = False  # whether stale events of the camera's last run can no longer come
+        self._judged = self._dropped = 0
+        self._first: int | None = None
+        self._newest: int | None = None
+        self._floor = -MAX_TIME
+        self._shift_us = 0
+        self._unjudged = self._held = NOTHING
 
-    def ordered(self, block: Block, counts: Counter[str], *, last: bool) -> Block:
-        """Events in time order that no later event can precede."""
-        block = joined([self.unjudged, block])
-        count = len(block.t) if last else max(0, len(block.t) - LOOKAHEAD)
-        keep = np.ones(count, np.bool_)
-        started = self.newest is not None
-        newest, glitches, unsorted, pauses, refused = _judge(block.t, keep, self.newest or 0, started, self.floor)
-        if refused >= 0:
-            t_us = int(block.t[refused])
-            raise RecordingError(
-                f"{self.name}: after event {self.judged + refused}, time goes back by {newest - t_us} us, from "
-                f"{newest} to {t_us} us, and stays there: the camera's clock was set anew, or recordings were joined; "
-                f"cut the file there"
-            )
-        counts.update({"time_glitches": int(glitches), "unsorted": int(unsorted), "pauses": int(pauses)})
-        self.judged += count
-        self.unjudged = block.rows(slice(count, None))
-        accepted = block.rows(slice(count))
-        if glitches:
-            accepted = accepted.rows(keep)
-        if len(accepted.t):
-            self.newest = int(newest)
-        accepted = joined([self.held, accepted])
-        if unsorted:
+    @property
+    def waiting(self) -> bool:
+        """Whether events are held back."""
+        return len(self._unjudged.t) + len(self._held.t) > 0
+
+    def ordered(self, block: Block, *, final: bool = False) -> Iterator[Block]:
+        """Events in time order that no later event can precede, with those of the next block of the input.
+
+        `final` judges all times by the events at hand: at the end, and where live input makes a pause.
+        """
+        shifted = block._replace(t=block.t + self._shift_us) if self._shift_us else block
+        rest = _joined([self._unjudged, shifted])
+        accepted, reset = [self._held], True
+        while reset:
+            judged, reset, which = self._judge(rest, sum(len(one.t) for one in accepted), final)
+            accepted.append(rest.rows(which))
+            rest = rest.rows(slice(judged, None))
+            if not reset:
+                break
+            ahead = rest.t[0] > (self._newest or 0)
+            if not self._settled and self._judged <= (FEW if ahead else MAX_STALE):
+                self.counts["stale"] += sum(len(one.t) for one in accepted)
+                accepted, self._newest = [NOTHING], None
+            elif self._live:
+                rest = self._set_anew(rest)
+            elif ahead:
+                self.counts["pauses"] += 1
+                self._newest = int(rest.t[0])
+            else:
+                self._settled = True
+                yield self._ready(_joined(accepted), final=True)
+                raise RecordingError(self._refusal(rest))
+        self._unjudged = rest
+        self._settled |= final or self._judged > MAX_STALE
+        yield self._ready(_joined(accepted), final)
+
+    def _judge(self, block: Block, before: int, final: bool) -> tuple[int, bool, np.ndarray | slice]:
+        """Number of judged events, whether the next one sets the clock anew, and which of them to keep."""
+        keep = np.ones(len(block.t), np.bool_)
+        state = self._newest is not None, self._newest or 0, self._floor, self._dropped
+        few = FEW if self._settled else min(FEW, before)
+        judged, reset, started, newest, self._dropped, counts = _judge(block.t, keep, *state, few, final)
+        self._judged += judged
+        self._newest = int(newest) if started else None
+        self.counts.update(dict(zip(("time_glitches", "unsorted", "late", "pauses"), counts.tolist(), strict=True)))
+        good = keep[:judged]
+        return judged, reset, slice(judged) if good.all() else np.flatnonzero(good)
+
+    def _ready(self, accepted: Block, final: bool) -> Block:
+        """The events that can be handed on; the others are held back."""
+        if not (np.diff(accepted.t) >= 0).all():
             accepted = accepted.rows(np.argsort(accepted.t, kind="stable"))
-        ready = len(accepted.t) if last else self._ready(accepted)
-        self.held = accepted.rows(slice(ready, None))
+        ready = len(accepted.t)
+        if not self._settled:
+            ready = 0
+        elif self._live:
+            self._floor = max(self._floor, int(accepted.t[-1])) if ready else self._floor
+        elif not final:
+            ready = int(np.searchsorted(accepted.t, (self._newest or 0) - LATE_US))
+            if len(accepted.t) - ready > MAX_HELD:
+                ready = len(accepted.t) // 2
+                self._floor = int(accepted.t[ready - 1])
+        if ready and self._first is None:
+            self._first = int(accepted.t[0])
+        self._held = accepted.rows(slice(ready, None))
         return accepted.rows(slice(ready))
 
-    def _ready(self, accepted: Block) -> int:
-        """Number of events more than `LATE_US` older than the newest; half of all if too many would be held back."""
-        ready = int(np.searchsorted(accepted.t, (self.newest or 0) - LATE_US))
-        if len(accepted.t) - ready > MAX_HELD:
-            ready = len(accepted.t) // 2
-            self.floor = int(accepted.t[ready - 1])
-        return ready
+    def _set_anew(self, rest: Block) -> Block:
+        """The events of live input from a clock's reset on, 10 ms after the newest event."""
+        assert self._newest is not None
+        shift_us = self._newest + LATE_US - int(rest.t[0])
+        if not self.counts["clock_resets"]:
+            logger.warning(
+                "%s: after event %d, the camera's clock goes from %d to %d us: frames go on as after a pause of %d ms; "
+                "later resets are only counted",
+                *(self.name, self._judged, self._newest - self._shift_us, int(rest.t[0]) - self._shift_us),
+                LATE_US // 1000,
+            )
+        self.counts["clock_resets"] += 1
+        self._shift_us += shift_us
+        return rest._replace(t=rest.t + shift_us)
+
+    def _refusal(self, rest: Block) -> str:
+        newest, t_us = self._newest or 0, int(rest.t[0])
+        kept_us = newest - (newest if self._first is None else self._first)
+        return (
+            f"{self.name}: after event {self._judged}, time goes back by {newest - t_us} us, from {newest} to {t_us} "
+            f"us, and stays there for {min(len(rest.t), MAX_RUN)} events: the camera's clock was set anew, or "
+            f"recordings were joined. `polarnet convert {self.name} OUT --stop {kept_us}us` writes the part before it"
+        )
 
 
 @numba.njit(nogil=True, cache=True)
 @no_type_check
-def _judge(t, keep, newest, started, floor):
-    """Mark the events with credible times in `keep`.
+def _judge(t, keep, started, newest, floor, dropped, few, final):
+    """Mark the events with credible times in `keep`, up to one that needs events not yet there.
 
-    Returns the newest time, the counts of glitches, late events and pauses, and the index of the refused event or -1.
+    Returns the number of judged events, whether the next one sets the clock anew, whether there was a credible time,
+    the newest one, the number of late events since the last credible one, and the counts of events far from the time of
+    others, out of order, too late, and after a pause.
     """
-    glitches, unsorted, pauses = 0, 0, 0
-    for i in range(len(keep)):
+    counts = np.zeros(4, np.int64)
+    i = 0
+    while i < len(t):
         now = t[i]
-        earliest = max(newest - LATE_US, floor)
-        if started and earliest <= now <= newest + LATE_US:
-            if now < newest:
-                unsorted += 1
-            else:
+        if not -MAX_TIME < now < MAX_TIME:
+            keep[i] = False
+            counts[0] += 1
+        elif not started:
+            started, newest = True, now
+        elif newest - LATE_US <= now <= newest + LATE_US:
+            keep[i] = now >= floor
+            counts[1] += floor <= now < newest
+            counts[2] += now < floor
+            newest = max(newest, now)
+            dropped = 0
+        else:
+            ahead = now > newest
+            back = _back(t, i, max(newest - LATE_US, floor), now - LATE_US if ahead else MAX_TIME, final)
+            if back == UNKNOWN:
+                break
+            if back == NEVER and not ahead and final and dropped + len(t) - i <= min(few + i, FEW):
+                dropped += len(t) - i
+                back = len(t)
+            if back == NEVER and (not ahead or now - newest > MAX_PAUSE_US):
+                return i, True, started, newest, 0, counts
+            if back == NEVER:
+                counts[3] += now - newest > PAUSE_US
                 newest = now
-            continue
-        representable = -MAX_TIME < now < MAX_TIME
-        after = t[i + 1 : i + 1 + LOOKAHEAD]
-        if not started or now > newest:
-            otherwise = 0
-            for later in after:
-                if (later < now - LATE_US and (not started or later >= earliest)) or (
-                    not started and later > now + FIRST_PAUSE_US
-                ):
-                    otherwise += 1
-            if representable and 2 * otherwise <= len(after):
-                pauses += started and now - newest > PAUSE_US
-                newest, started = now, True
-                continue
-        elif representable:
-            otherwise = 0
-            for later in after:
-                if later >= earliest:
-                    otherwise += 1
-            if 2 * otherwise < len(after):
-                return newest, glitches, unsorted, pauses, i
-        keep[i] = False
-        glitches += 1
-    return newest, glitches, unsorted, pauses, -1
+                dropped = 0
+            else:
+                keep[i:back] = False
+                counts[0] += back - i
+                i = back - 1
+        i += 1
+    return i, False, started, newest, dropped, counts
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _back(t, i, low, high, final):
+    """Index of the event that brings time back into [low, high) after event `i`, for at least as long as it was away.
+
+    It comes back by a jump: a clock that was set back catches up smoothly. NEVER if there is no such event among the
+    next `MAX_RUN`, UNKNOWN if that takes events not yet there.
+    """
+    for j in range(i + 1, min(len(t), i + 1 + MAX_RUN)):
+        if low <= t[j] < high and abs(float(t[j]) - float(t[j - 1])) > LATE_US:
+            end = j + 1 + max(FEW, j - i)
+            if end > len(t) and not final:
+                return UNKNOWN
+            inside, others = 0, 0
+            for k in range(j + 1, min(end, len(t))):
+                if low <= t[k] < high:
+                    inside += 1
+                else:
+                    others += 1
+            if inside >= others:
+                return j
+    return NEVER if final or len(t) > i + MAX_RUN else UNKNOWN

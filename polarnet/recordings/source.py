@@ -25,14 +25,16 @@ REPAIRS = {
     "bad_polarity": "events of a polarity that is neither brighter nor darker: left out",
     "bad_angle": "live events of an angle that is not 0, 45, 90 or 135: left out",
     "out_of_range": "events that are not on the sensor: left out",
+    "stale": "first events on another clock, of the camera's last run: left out",
     "time_glitches": "events far from the time of those before and after them: left out",
     "unsorted": "events a little earlier than the one before: put in order",
     "late": "live events earlier than others that were used already: left out",
+    "clock_resets": "times at which the clock of live input was set anew: events go on after 10 ms",
     "pauses": "pauses of a second or more between events: kept",
 }
 """Kinds of damage that readers count. No event is ever given another time, pixel or polarity."""
 
-SAFE = ("cut_tail", "no_change", "unsorted", "late", "pauses")
+SAFE = ("cut_tail", "no_change", "stale", "unsorted", "late", "clock_resets", "pauses")
 """Repairs allowed any number of times. A file with too many of another kind is refused."""
 
 

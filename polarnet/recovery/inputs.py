@@ -1,33 +1,35 @@
 """Inputs of `polarnet recover`: files in any arrangement of polarizers, stores, folders of captures, live input."""
 
+import itertools
 import math
 import shutil
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import calibrate_targets, import_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
 from polarnet.events.streaming import WindowRule
-from polarnet.recordings.arrangements import read_four, read_mosaic, read_plain, shifted
+from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
-from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines, Piece
+from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
-from polarnet.recordings.recording import Recording, detect_format, read_recording
+from polarnet.recordings.recording import detect_format, open_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import EXPORT_INDEX
 from polarnet.storage.parts import unknown_sequence
 
 STANDARD_INPUT = "-"
+STEPS_PER_BLOCK = 64  # steps of the store's index, 2**14 events each
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,13 @@ class Files:
     """Sequence to read from an event store or a folder that holds several."""
     plain: bool = False
     """Whether any other file is one channel, of a camera without polarizers."""
-    read: Callable[[Path], Recording] = read_recording
+    open: Open = open_recording
     captures: RecordingsConfig | None = None
     """Settings of division-of-time captures; needed for a folder of them."""
 
 
 def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
-    """Read channels from files, starting at time 0 and reduced to `size` (height, width) if given.
+    """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, a folder
     that `polarnet export` wrote, or a folder of division-of-time captures, which are calibrated in `work`. `clean`
@@ -57,24 +59,24 @@ def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clea
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
-    return _whole(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
+    return _input(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
 
 
 def open_rotating(
-    path: Path, rotation: Rotation, read: Callable[[Path], Recording], size: Sequence[int] | None
+    path: Path, rotation: Rotation, open_file: Open, size: Sequence[int] | None
 ) -> tuple[Input, Rotation]:
-    """Read the events of one camera behind a rotating polarizer, and count times from the first event.
+    """Open the events of one camera behind a rotating polarizer, whose times count from the first event.
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
     """
-    events = read(path).events
-    if not len(events):
+    channels = open_plain(path, open_file)
+    first = next(channels.blocks(), None)
+    if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
-    start_us = int(events.t[0])
-    return _whole(path.name, [shifted(events, start_us)], size), rotation.since(start_us)
+    return _input(path.name, channels, size), rotation.since(int(first[0].t[0]))
 
 
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> Input:
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
     """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
 
     ValueError for a camera without a mosaic.
@@ -90,7 +92,8 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> Input:
         reader = LiveLines(open(path, "rb"), Path(path).name, mosaic, idle_s)  # noqa: SIM115 - read until the end
     else:
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
-    return Input(reader.name, reader.height, reader.width, reader, None, left_out=reader.counts)
+    pieces = clean.clean(reader, live=True)
+    return Input(reader.name, reader.height, reader.width, pieces, {reader.name: reader.counts}, live=True)
 
 
 def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: float) -> Rotation:
@@ -113,40 +116,57 @@ def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule
     return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None, None)
 
 
-def _whole(name: str, channels: Sequence[Events], size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
-    duration_us = max((int(events.t[-1]) + 1 for events in channels if len(events)), default=0)
-    if clean is not None:
-        channels = clean(channels, duration_us)
-    if size is not None:
-        channels = [downscale(events, *size, keep_rate=True) for events in channels]
-    pieces = [Piece(channels, duration_us, time.perf_counter())]
-    return Input(name, channels[0].height, channels[0].width, pieces, duration_us, len(channels))
+def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
+    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
+    pieces = channels if clean is None else clean.clean(channels)
+    height, width = size or (channels.height, channels.width)
+    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
+    return Input(name, height, width, pieces, repairs, channels.number)
 
 
-def _channels(files: Files, work: Path) -> Sequence[Events]:
+def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
+    """Pieces with the fewer pixels of `sums`, see `downscale`."""
+    for piece in pieces:
+        both = zip(piece.channels, sums, strict=True)
+        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
+
+
+def _channels(files: Files, work: Path) -> Channels:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        return read_four(dict(zip(files.angles, files.paths, strict=True)), read=files.read)
+        return open_four(dict(zip(files.angles, files.paths, strict=True)), open_file=files.open)
     if len(files.paths) != 1 or files.angles is not None:
         raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
     (path,) = files.paths
     if files.mosaic is not None:
-        return read_mosaic(path, files.mosaic, files.read)
+        return open_mosaic(path, files.mosaic, files.open)
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captured(path, work, files.captures)
     if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return read_four(exported, dict.fromkeys(exported, 0), files.read)  # times count from the sequence's start
+        return open_four(exported, dict.fromkeys(exported, 0), files.open)  # times count from the sequence's start
     if detect_format(path) == "store":
         store = EventStore.open(path)
-        return store.read(_named(files.sequence, store.sequences, path.name))
+        return _stored(store, _named(files.sequence, store.sequences, path.name))
     if files.plain:
-        return read_plain(path, files.read)
+        return open_plain(path, files.open)
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
         f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
         f"...; for its intensity alone, give a --method that reconstructs it, such as firenet or highpass"
     )
+
+
+def _stored(store: EventStore, sequence: str) -> Channels:
+    """A sequence of a store, in blocks of about a million events."""
+
+    def blocks() -> Iterator[Sequence[Events]]:
+        times = sorted(itertools.chain(*store.record(sequence)["index"]))
+        edges = [0, *sorted(set(times[STEPS_PER_BLOCK::STEPS_PER_BLOCK]) - {0}), None]
+        for start_us, stop_us in itertools.pairwise(edges):
+            yield store.read(sequence, start_us, stop_us)
+
+    return Channels(store.height, store.width, blocks, origin_us=0)
 
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
@@ -174,7 +194,7 @@ def _named(sequence: str | None, names: list[str], where: str) -> str:
     return sequence
 
 
-def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Sequence[Events]:
+def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Channels:
     if config is None:
         raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
     root = work / "targets"
@@ -184,7 +204,7 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Sequ
     target.symlink_to(folder.resolve(), target_is_directory=True)
     import_targets(root, work / "imported", config)
     calibrate_targets(work / "imported", work / "calibrated", config, {})
-    return EventStore.open(work / "calibrated" / "events.zarr").read(target.name)
+    return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:

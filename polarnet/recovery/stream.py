@@ -19,15 +19,14 @@ from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
-BAR = "{l_bar}{bar}| {n:.2f}/{total:.2f} s [{elapsed}<{remaining}{postfix}]"
-LIVE_BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
 SCORES = {
     "mse": "MSE {:.4f}",
@@ -39,18 +38,18 @@ SCORES = {
 
 
 class Input(NamedTuple):
-    """Events of channels of equal size, read whole or piece by piece."""
+    """Events of channels of equal size, piece by piece."""
 
     name: str
     height: int
     width: int
     pieces: Iterable[Piece]
-    duration_us: int | None
-    """None for live input, whose duration is unknown."""
+    repairs: Mapping[str, Mapping[str, int]] = {}
+    """Unusable events by file and kind (`polarnet.recordings.source.REPAIRS`), counted while `pieces` are read."""
     channels: int = 4
     """4, or 1 for a camera behind a rotating polarizer or none."""
-    left_out: Mapping[str, int] | None = None
-    """Unusable and late lines of live input by kind, counted while `pieces` are read; None for files."""
+    live: bool = False
+    """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
 
 
 class Frame(NamedTuple):
@@ -110,25 +109,36 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
-    """Yield a frame for each window as soon as the window's last event has arrived.
+    """Yield a frame for each window, of live input as soon as the window's last event has arrived.
 
     Windows that are already available, such as those of a file, are processed in runs of up to `at_once` windows
-    (default: `Recoverer.at_once`).
+    (default: `Recoverer.at_once`). ValueError if the input is shorter than one window.
     """
     warm_up(recoverer, source.height, source.width, source.channels)
     cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
     most = at_once or recoverer.at_once(source.height, source.width)
-    for piece in source.pieces:
-        for windows in runs_of(cutter.add(piece.channels, piece.until_us), most):
+    latest: Piece | None = None
+    number = 0
+
+    def windows(pieces: Iterable[Piece]) -> Iterator[EventWindow]:
+        nonlocal latest
+        for latest in pieces:
+            yield from cutter.add(latest.channels, latest.until_us)
+
+    for pieces in ([piece] for piece in source.pieces) if source.live else [source.pieces]:
+        for run in runs_of(windows(pieces), most):
             start = time.perf_counter()
-            history, prediction = advance(recoverer, history, windows)
+            history, prediction = advance(recoverer, history, run)
             maps = each_map(prediction, Tensor.cpu)
             done = time.perf_counter()
-            for k, window in enumerate(windows):
+            for k, window in enumerate(run):
                 frame = each_map(maps, operator.itemgetter(k))
                 _check_finite(frame, window)
-                yield Frame(window, frame, (done - start) / len(windows), done - piece.read_at)
+                number += 1
+                yield Frame(window, frame, (done - start) / len(run), done - latest.read_at if latest else 0.0)
+    if not number:
+        raise ValueError(_too_short(source, rule, latest.until_us if latest else 0))
 
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:
@@ -156,25 +166,18 @@ def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWin
 def recover(
     source: Input, rule: WindowRule, words: str, writer: RecoveryWriter, frames: Iterable[Frame]
 ) -> dict[str, str]:
-    """Write all frames of the method that `words` describe, with a progress bar; facts for the page and the terminal.
-
-    ValueError if the input is shorter than one window.
-    """
-    live = source.duration_us is None
+    """Write all frames of the method that `words` describe; returns facts for the page and the terminal."""
     step_ms, latency_ms = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
     last_us, started = 0, time.perf_counter()
-    bar_format = LIVE_BAR if live else BAR
-    with writer, ProgressBar(total=source.duration_us, desc="recover", unit_scale=1e-6, bar_format=bar_format) as bar:
+    with writer, ProgressBar(desc="recover", unit_scale=1e-6, bar_format=BAR) as bar:
         for frame in frames:
-            writer.add(frame.window, frame.prediction, live)
+            writer.add(frame.window, frame.prediction, source.live)
             step_ms.append(1000 * frame.step_s)
             latency_ms.append(1000 * frame.latency_s)
             bar.update(frame.window.stop_us - last_us)
             last_us = frame.window.stop_us
-            latency = {"latency": f"{latency_ms[-1]:.1f} ms"} if live else {}
+            latency = {"latency": f"{latency_ms[-1]:.1f} ms"} if source.live else {}
             bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **latency)
-    if not step_ms:
-        raise ValueError(_too_short(source, rule))
     run_s, stream_s = time.perf_counter() - started, last_us * 1e-6
     length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
     step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
@@ -186,28 +189,28 @@ def recover(
         "frames": f"{len(step_ms):,} of {stream_s:.3f} s",
         "step": f"{statistics.median(step_ms):.2f} ms (median)",
     }
-    if not live:
+    if not source.live:
         return facts | {"time": f"{run_s:.2f} s, {stream_s / run_s:.2f} times as fast as real time"}
     most_ms = sorted(latency_ms)[int(0.95 * (len(latency_ms) - 1))]
     return facts | {"latency": f"{statistics.median(latency_ms):.1f} ms (median), 95 % within {most_ms:.1f} ms"}
 
 
-def _too_short(source: Input, rule: WindowRule) -> str:
+def _too_short(source: Input, rule: WindowRule, duration_us: int) -> str:
     """Error message for an input shorter than one window, with advice."""
     if rule.length_us is None:
         return f"{source.name} ends before {rule.events:,} events, one window: record for longer, or give fewer events"
-    length = f"one window of {rule.length_us / 1000:g} ms"
-    if source.duration_us is None:
-        return f"{source.name} ended before {length} was full: record for longer"
-    lasts = f"{source.name} lasts {source.duration_us / 1000:g} ms, less than {length}: record for longer"
-    if source.duration_us >= TRAINED_WINDOW_US:
+    lasts = (
+        f"{source.name} lasts {duration_us / 1000:g} ms, less than one window of {rule.length_us / 1000:g} ms: record "
+        f"for longer"
+    )
+    if source.live or duration_us < SHORTEST_STEP_US:
+        return lasts
+    if duration_us >= TRAINED_WINDOW_US:
         return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
-    if source.duration_us >= SHORTEST_STEP_US:
-        return (
-            f"{lasts}. Networks need windows of {TRAINED_WINDOW_US / 1000:g} ms, filters do not: "
-            f"--method highpass --window {source.duration_us}us"
-        )
-    return lasts
+    return (
+        f"{lasts}. Networks need windows of {TRAINED_WINDOW_US / 1000:g} ms, filters do not: "
+        f"--method highpass --window {duration_us}us"
+    )
 
 
 class TruthScores:

@@ -109,7 +109,7 @@ class EventStore(Store):
         """
         record = self.record(sequence)
         if start_us is None and stop_us is None:
-            (events,) = self._events(sequence, [(0, record["offsets"][-1])])
+            (events,) = self.rows(sequence, [(0, record["offsets"][-1])])
             return [slice_count(events, start, stop) for start, stop in itertools.pairwise(record["offsets"])]
         start_us = max(0, start_us or 0)
         stop_us = MAX_DURATION_US + 1 if stop_us is None else max(start_us, stop_us)
@@ -117,9 +117,9 @@ class EventStore(Store):
         for (first, end), index in zip(itertools.pairwise(record["offsets"]), record["index"], strict=True):
             before, after = bisect.bisect_left(index, start_us), bisect.bisect_left(index, stop_us)
             spans.append((first + max(0, before - 1) * INDEX_STEP, min(first + after * INDEX_STEP, end)))
-        return [slice_time(events, start_us, stop_us) for events in self._events(sequence, spans)]
+        return [slice_time(events, start_us, stop_us) for events in self.rows(sequence, spans)]
 
-    def _events(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
+    def rows(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
         """The events in each of the spans (start, stop) of a sequence's rows."""
         return [
             Events(

@@ -13,7 +13,7 @@ from polarnet.config.pipeline import context_of
 from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule
 from polarnet.methods import METHODS, ROWS
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.stream import Input, frames_of
 from polarnet.reports.tables import score_table
 
@@ -60,7 +60,7 @@ def test_it_needs_no_section_in_the_configuration(activity, project_root):
 
 def test_recover_runs_it(activity, sequence, make_setup):
     channels = sequence.events
-    source = Input("test", channels[0].height, channels[0].width, [Piece(channels, 4000, 0.0)], 4000)
+    source = Input("test", channels[0].height, channels[0].width, [Piece(channels, 4000, 0.0)])
     frames = list(frames_of(source, WindowRule(1000, None, None), activity.open(make_setup("activity"))))
     assert [frame.window.stop_us for frame in frames] == [1000, 2000, 3000, 4000]
     assert frames[-1].prediction.dolp.sum().item() == pytest.approx(4 * 300 * EVENT)

@@ -1,5 +1,7 @@
 """`polarnet convert`."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from event_fixtures import events_of, random_events
 
 from polarnet.cli import main
 from polarnet.recordings.recording import read_recording
-from polarnet.storage.exchange import write_text
+from polarnet.recordings.writers import write_text
 
 EVENTS = [(1_000_000, 3, 4, 1), (1_250_000, 5, 6, -1), (1_500_000, 0, 0, 1), (1_750_000, 7, 7, -1)]
 
@@ -26,16 +28,18 @@ def test_all_events_arrive_in_every_format_with_time_0_at_the_first(recording, t
     assert (events.height, events.width) == (8, 9)
     rows = torch.stack([events.t, events.x.long(), events.y.long(), events.p.long()], 1).tolist()
     assert rows == [[t - 1_000_000, x, y, p] for t, x, y, p in EVENTS]
-    assert "4 of 4 events, time 0 is 1000000 us" in capsys.readouterr().out
+    assert "4 events, time 0 is 1000000 us" in capsys.readouterr().out
 
 
 def test_a_span_is_half_open_and_counts_from_the_first_event(recording, tmp_path, capsys):
     out = tmp_path / "out.txt"
     assert main(["convert", str(recording), str(out), "--start", "250ms", "--stop", "0.75s"]) == 0
     assert read_recording(out).events.t.tolist() == [0, 250_000]
-    assert "2 of 4 events, time 0 is 1250000 us" in capsys.readouterr().out
+    assert "2 events, time 0 is 1250000 us" in capsys.readouterr().out
     assert main(["convert", str(recording), str(out), "--start", "1s", "--stop", "500ms"]) == 1
     assert "expected --stop after --start, got 1000000 to 500000 us" in capsys.readouterr().err
+    assert main(["convert", str(recording), str(out), "--start", "1s"]) == 1
+    assert "expected events between --start and --stop, there are none" in capsys.readouterr().err
     assert read_recording(out).events.t.tolist() == [0, 250_000]
 
 
@@ -44,9 +48,23 @@ def test_what_cannot_be_converted_is_refused(recording, tmp_path, capsys):
     assert "expected a suffix of .h5, .hdf5, .txt, .raw, or --to FORMAT" in capsys.readouterr().err
     assert main(["convert", str(recording), str(recording)]) == 1
     assert "expected another file than the one to convert" in capsys.readouterr().err
-    assert main(["convert", str(recording), str(tmp_path / "o.txt"), "--stop", "5ev"]) == 1
-    assert "--stop: expected a time such as 500ms" in capsys.readouterr().err
+    for time in ("5ev", "100"):
+        assert main(["convert", str(recording), str(tmp_path / "o.txt"), "--stop", time]) == 1
+        assert f"--stop: expected a time such as 500ms, got {time}" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.txt"]
+
+
+def test_the_part_before_a_reset_of_the_clock_is_converted_as_advised(tmp_path, capsys):
+    times = [*range(5_000_000, 5_400_000, 1000), *range(1000, 400_000, 1000)]
+    (tmp_path / "in.txt").write_text("8 9\n" + "".join(f"{t} 3 4 1\n" for t in times))
+    assert main(["convert", str(tmp_path / "in.txt"), str(tmp_path / "out.h5")]) == 1
+    message = capsys.readouterr().err
+    assert "after event 400, time goes back by 5398000 us, from 5399000 to 1000 us, and stays there" in message
+    assert not (tmp_path / "out.h5").exists()
+    advice = re.search(r"--stop \d+us", message)
+    assert advice is not None
+    assert main(["convert", str(tmp_path / "in.txt"), str(tmp_path / "out.h5"), *advice[0].split()]) == 0
+    assert read_recording(tmp_path / "out.h5").events.t.tolist() == [t - 5_000_000 for t in times[:399]]
 
 
 def test_events_go_round_through_three_formats_unchanged(tmp_path, capsys):

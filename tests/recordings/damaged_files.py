@@ -13,8 +13,8 @@ from polarnet.events.stream import Events, slice_count, validate
 from polarnet.recordings.formats.celex5 import celex5_pictures
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import REPAIRS, RecordingError
+from polarnet.recordings.writers import write_hdf5, write_text
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import write_hdf5, write_text
 from studies.celex5_writer import write_celex5_bin, write_celex5_csv
 from studies.rosbag_writer import write_bag
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events, merge, slice_time
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece
 from polarnet.recordings.noise import (
     Cleaner,
     Cleaning,
@@ -67,13 +67,13 @@ def test_an_event_stays_if_one_of_its_8_neighbours_fired_within_the_time(make_ev
 def test_a_recording_in_pieces_is_cleaned_as_a_whole(make_random_events):
     channels = [make_random_events(seed, 3000, 10**6, 20, 30) for seed in range(4)]
     whole, pieces = (Cleaner(Cleaning(None, 4.0, 20_000), None) for _ in range(2))
-    together = whole(channels, 10**6)
+    (together,) = whole.clean([Piece(channels, 10**6, 0.0)])
     parts = [
         Piece([slice_time(events, start, stop) for events in channels], stop, 0.0)
         for start, stop in itertools.pairwise([0, 333_333, 700_000, 10**6 + 1])
     ]
-    joined = [*pieces.live(parts)]
-    for k, events in enumerate(together):
+    joined = [*pieces.clean(parts, live=True)]
+    for k, events in enumerate(together.channels):
         assert torch.equal(torch.cat([piece.channels[k].t for piece in joined]), events.t)
     assert pieces.removed == whole.removed
     assert 0 < whole.removed["background activity"] < 12_000
@@ -83,7 +83,8 @@ def test_listed_hot_pixels_of_a_mosaic_are_those_of_the_sensor(make_events, tmp_
     (tmp_path / "hot.txt").write_text("# x y\n3 2\n\n0, 1\n")
     channel = make_events([(0, 1, 1, 1), (1, 0, 0, 1)], 3, 4)
     cleaner = Cleaner(Cleaning(str(tmp_path / "hot.txt"), 4.0, None), parse_mosaic("90 45 / 135 0"))
-    i0, i45, i90, i135 = cleaner([channel] * 4, 10)
+    (piece,) = cleaner.clean([Piece([channel] * 4, 10, 0.0)])
+    i0, i45, i90, i135 = piece.channels
     assert i45.t.tolist() == [1]  # 3 2 is the pixel behind 45 degrees of the cell in column 1, row 1
     assert i135.t.tolist() == [0]  # 0 1 is the pixel behind 135 degrees of the cell in column 0, row 0
     assert i0.t.tolist() == i90.t.tolist() == [0, 1]
@@ -94,12 +95,14 @@ def test_found_hot_pixels_are_removed_from_their_channel_alone(make_random_event
     quiet = make_random_events(1, 400, 10**6, 12, 16)
     hot = merge([quiet, make_events([(t, 5, 5, 1) for t in range(0, 10**6, 1000)], 12, 16)])
     cleaner = Cleaner(Cleaning("found", 4.0, None), None)
-    first, second, *_ = cleaner([hot, quiet, quiet, quiet], 10**6)
-    assert not ((first.x == 5) & (first.y == 5)).any()
-    assert torch.equal(second.t, quiet.t)
+    channels, ends = [hot, quiet, quiet, quiet], [0, 250_000, 10**6]
+    parts = [Piece([slice_time(e, *span) for e in channels], span[1], 0.0) for span in itertools.pairwise(ends)]
+    first, second, *_ = zip(*(piece.channels for piece in cleaner.clean(parts)), strict=True)
+    assert not any(((part.x == 5) & (part.y == 5)).any() for part in first)
+    assert sum(map(len, second)) == len(quiet)
     assert cleaner.hot == 1
     with pytest.raises(ValueError, match="expected a file of hot pixels for live input"):
-        next(Cleaner(Cleaning("found", 4.0, None), None).live([]))
+        Cleaner(Cleaning("found", 4.0, None), None).clean([], live=True)
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,7 @@ def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
         assert next(pieces).until_us == 300
         camera.close()
         assert list(pieces) == []
-    assert live.counts == {"late": 1, "out_of_range": 1, "bad_polarity": 1, "bad_angle": 1, "unreadable_lines": 1}
+    assert +live.counts == {"late": 1, "out_of_range": 1, "bad_polarity": 1, "bad_angle": 1, "unreadable_lines": 1}
 
 
 @pytest.mark.parametrize(("text", "reason"), [
@@ -130,6 +130,52 @@ def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
             time.sleep(0.001)
         after = time.perf_counter()
         assert all(before <= piece.read_at <= after for piece in live)
+
+
+def test_comments_may_come_before_the_size_in_pieces_of_their_own():
+    with pipe() as (source, camera):
+        camera.write(b"# a camera\n\n")
+        threading.Timer(0.05, camera.write, [b"  # its size\n4 3 # px\n0 0 0 1 0\n"]).start()
+        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        assert (live.height, live.width) == (3, 4)
+        assert next(iter(live)).until_us == 0
+
+
+def test_wrong_times_are_dropped_and_a_reset_of_the_clock_goes_on_with_one_warning(tmp_path, caplog):
+    stale, steady = range(5 * 10**9, 5 * 10**9 + 5), range(10**9, 10**9 + 400_000, 1000)
+    times = [*stale, *steady[:200], 10**12, *steady[200:], *range(0, 400_000, 1000), *range(0, 400_000, 1000)]
+    live, pieces = read_lines(tmp_path, "4 3\n" + "".join(f"{t} 1 1 1 45\n" for t in times))
+    counts = {kind: count for kind, count in live.counts.items() if count}
+    assert counts == {"stale": 5, "time_glitches": 1, "clock_resets": 2}
+    t = torch.cat([piece.channels[1].t for piece in pieces])
+    assert len(t) == len(times) - 6
+    assert (t.diff() >= 0).all()
+    assert sum("frames go on as after a pause" in message for message in caplog.messages) == 1
+
+
+def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
+    with pipe() as (source, camera):
+        camera.write(b"4 3\n0 0 0 1 0\n")
+        pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
+        assert next(pieces).until_us == 0
+        written = time.perf_counter()
+        camera.write(b"500000 0 0 1 0\n")
+        piece = next(pieces)
+        assert piece.until_us == 500_000
+        assert written <= piece.read_at <= time.perf_counter()
+        assert time.perf_counter() - written < 1.0
+
+
+@pytest.mark.parametrize(("name", "events", "counts"), [
+    ("stale_first_3", 400, {"stale": 3}), ("live_glitch_20s", 1999, {"time_glitches": 1}),
+    ("live_one_wrong_time", 399, {"time_glitches": 1}), ("live_clock_reset", 800, {"clock_resets": 1}),
+    ("late_run_10", 1990, {"time_glitches": 10}), ("comment_first", 400, {}),
+])  # fmt: skip
+def test_recordings_that_failed_live_go_on(shared, name, events, counts):
+    with (shared / "cases" / "recordings" / f"{name}.txt").open("rb") as file:
+        live = LiveLines(file, name, MOSAIC, idle_s=0.0)
+        assert sum(len(channel) for piece in live for channel in piece.channels) == events
+    assert {kind: count for kind, count in live.counts.items() if count} == counts
 
 
 @pytest.fixture

@@ -10,8 +10,7 @@ import torch
 from polarnet.events.mosaic import join_mosaic, split_mosaic
 from polarnet.events.stream import Events, merge
 from polarnet.events.streaming import WindowCutter, WindowRule
-from polarnet.recordings.arrangements import read_mosaic
-from polarnet.recordings.live import Piece
+from polarnet.recordings.arrangements import Piece, read_mosaic
 from polarnet.recordings.polarizers import WINDOW_US, ChannelCheck, pair_misfits
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate
 from polarnet.simulation.scene import polarization_from_rgb

@@ -3,7 +3,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from polarnet.recordings.repair import LATE_US, LOOKAHEAD, repaired
+from polarnet.recordings.repair import FEW, LATE_US, MAX_RUN, MAX_STALE, Clock, repaired
 from polarnet.recordings.source import Block, RecordingError, Source
 
 
@@ -68,18 +68,94 @@ def test_one_wild_time_is_left_out_wherever_it_stands():
         for wild in (10**12, -(10**12), 2**62):
             rows, counts = read([at([*sound[:place], wild, *sound[place:]])])
             assert times_of(rows) == sound
-            assert counts == {"time_glitches": 1}
+            assert counts == {"stale" if place == 0 and wild != 2**62 else "time_glitches": 1}
 
 
-def test_a_clock_that_was_set_anew_is_refused_with_the_place():
-    times = [*range(10**6, 10**6 + 1000), *range(1000)]
-    message = r"a\.bin: after event 1000, time goes back by 1000999 us, from 1000999 to 0 us, and stays there"
-    with pytest.raises(RecordingError, match=message):
-        read([at(times)])
+STEADY = list(range(10**6, 4 * 10**6, 1000))
+HOUR_US = 3_600_000_000
+REFUSED = "time goes back by"
+
+
+@pytest.mark.parametrize(
+    ("times", "file", "live"),
+    [
+        (STEADY, {}, {}),
+        ([*STEADY[:1000], *range(10**6, 10**6 + 10_000, 1000), *STEADY[1000:]], {"time_glitches": 10}, None),
+        ([*STEADY[:1000], *range(10**8, 10**8 + 20_000, 1000), *STEADY[1000:]], {"time_glitches": 20}, None),
+        ([*STEADY, *range(10**6, 10**6 + 3000, 1000)], {"time_glitches": 3}, None),
+        ([*range(5 * 10**9, 5 * 10**9 + 20), *STEADY], {"stale": 20}, None),
+        ([*range(8), *(t + 2 * HOUR_US for t in STEADY)], {"stale": 8}, None),
+        ([*STEADY[:1000], 20 * 10**6, *STEADY[1000:]], {"time_glitches": 1}, None),
+        ([*STEADY, *(t - 10**6 for t in STEADY)], REFUSED, {"clock_resets": 1}),
+        ([*STEADY, *STEADY], REFUSED, {"clock_resets": 1}),
+        ([*STEADY, *STEADY[:9]], REFUSED, {"clock_resets": 1}),
+        ([*STEADY, *range(4 * 10**6 - 50_000, 6 * 10**6, 1000)], REFUSED, {"clock_resets": 1}),
+        ([*STEADY, *(t + 2 * HOUR_US for t in STEADY)], {"pauses": 1}, {"clock_resets": 1}),
+        ([*STEADY, *(t + 20 * 10**6 for t in STEADY)], {"pauses": 1}, None),
+    ],
+    ids=[
+        "sound", "late", "early", "late at the end", "stale", "stale before", "one wrong time", "reset",
+        "joined", "reset near the end", "small reset", "jump of two hours", "pause",
+    ],
+)  # fmt: skip
+def test_the_clock_rule_is_the_same_for_files_and_live_input(times, file, live):
+    """Live input differs in resets and jumps alone, after which events go on."""
+    rows = at(times)
+    if file is REFUSED:
+        with pytest.raises(RecordingError, match=r"stays there .*`polarnet convert a.bin OUT --stop \d+us` writes"):
+            read([rows])
+    else:
+        mended, counts = read([rows])
+        assert counts == file
+        assert len(mended) == len(rows) - sum(counts.get(kind, 0) for kind in ("stale", "time_glitches"))
+    for size in (7, 100, len(rows)):
+        counts, ready = Counter(), []
+        clock = Clock("camera", counts, live=True)
+        blocks = [np.array(rows[i : i + size]).T for i in range(0, len(rows), size)]
+        for k, (t, x, y, p) in enumerate(blocks):
+            for block in clock.ordered(Block(np.ascontiguousarray(t), x, y, p), final=k == len(blocks) - 1):
+                ready.extend(block.t.tolist())
+        expected = file if live is None else live
+        assert {kind: count for kind, count in counts.items() if count} == expected
+        assert ready == sorted(ready)
+        assert len(ready) == len(rows) - sum(expected.get(kind, 0) for kind in ("stale", "time_glitches"))
+        if live:
+            assert max(np.diff(ready)) == LATE_US
+
+
+def test_a_camera_that_was_reset_goes_on_even_if_its_events_come_one_by_one(caplog):
+    """Each event waits until its patience has ended; up to 8 are lost until the new clock is believed."""
+    counts: Counter[str] = Counter()
+    clock = Clock("camera", counts, live=True)
+    times = [*range(10**6, 2 * 10**6, 50_000), *range(0, 10**6, 50_000), *range(0, 10**6, 50_000)]
+    ready = []
+    for row in at(times):
+        block = Block(*np.array([row]).T)
+        for part in (*clock.ordered(block), *clock.ordered(block.rows(slice(0)), final=True)):
+            ready.extend(part.t.tolist())
+    assert counts["clock_resets"] == 2
+    assert counts["time_glitches"] <= 2 * FEW
+    assert len(ready) == len(times) - counts["time_glitches"]
+    assert sum("camera's clock goes from" in message for message in caplog.messages) == 1
+
+
+def test_events_before_a_reset_are_handed_on_first():
+    rows = at([*STEADY, *STEADY])
+    source = Source(10, 10, lambda counts: iter([Block(*np.array(rows).T)]))
+    blocks = repaired("a.bin", source, Counter())
+    assert next(blocks).t.tolist() == STEADY
+    with pytest.raises(RecordingError, match=r"a\.bin: after event 3000, time goes back by 2999000 us"):
+        next(blocks)
+
+
+def test_times_that_fall_all_the_time_are_refused_and_not_dropped_as_stale():
+    with pytest.raises(RecordingError, match="and stays there"):
+        read([at(range(10**8, 0, -20_000))])
+    assert MAX_STALE < MAX_RUN
 
 
 def test_the_largest_step_back_that_is_repaired_is_ten_milliseconds():
-    later = [30_000 + k for k in range(2 * LOOKAHEAD)]
+    later = [30_000 + k for k in range(2 * FEW)]
     rows, counts = read([at([20_000, 20_000 - LATE_US, *later])])
     assert (times_of(rows)[0], counts) == (10_000, {"unsorted": 1})
     assert read([at([20_000, 20_000 - LATE_US - 1, *later])])[1] == {"time_glitches": 1}
@@ -95,7 +171,7 @@ def test_blocks_of_any_length_give_the_same_events():
     times = np.cumsum(generator.integers(0, 50, 2000)) + generator.integers(-5000, 5000, 2000)
     rows = at((times + 5000).tolist())
     expected = read([rows])
-    for size in (1, 3, LOOKAHEAD, 100, 1999):
+    for size in (1, 3, FEW, 100, 1999):
         assert read([rows[i : i + size] for i in range(0, len(rows), size)]) == expected
     assert times_of(expected[0]) == sorted(times_of(rows))
 

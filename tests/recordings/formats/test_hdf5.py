@@ -4,7 +4,7 @@ import pytest
 from polarnet.recordings.formats.hdf5 import trigger_times_us
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.storage.exchange import write_hdf5
+from polarnet.recordings.writers import write_hdf5
 
 h5py = pytest.importorskip("h5py")
 

@@ -3,7 +3,7 @@ import pytest
 
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.storage.exchange import write_text
+from polarnet.recordings.writers import write_text
 
 
 def test_text_that_polarnet_exports_reads_back_equal(tmp_path, make_random_events, same_events):

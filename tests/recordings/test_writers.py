@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.events.stream import slice_count
 from polarnet.recordings.recording import read_recording
+from polarnet.recordings.writers import export_store, write_evt3, write_hdf5, write_text
 from polarnet.storage.events import EventStore
-from polarnet.storage.exchange import export_store, write_evt3, write_hdf5, write_text
 
 HEIGHT, WIDTH = 12, 18
 
@@ -48,7 +49,7 @@ def test_hdf5_has_dsecs_names_and_types(make_events, tmp_path):
         assert {name: file[f"events/{name}"].dtype.name for name in "xytp"} == {
             "x": "uint16",
             "y": "uint16",
-            "t": "uint32",
+            "t": "int64",
             "p": "uint8",
         }
         assert file["events/p"][:].tolist() == [1, 0, 1, 0]
@@ -72,6 +73,34 @@ def test_evt3_words_are_time_row_and_column_and_silence_keeps_the_clock_running(
     assert words[-4:].tolist() == [0x8000, 0x6007, 0x000B, 0x2811]
     assert len(words) == 5 + 2**13 + 3
     assert read_recording(tmp_path / "e.raw").events.t.tolist() == [5, 5, 2**25 + 7]
+
+
+@pytest.mark.parametrize("write", [write_hdf5, write_text, write_evt3])
+def test_chunks_of_a_recording_of_100_minutes_give_the_file_of_the_whole(write, make_events, tmp_path):
+    times = [0, 1500, 2 * 10**9, 2**32 - 1, 2**32, 6 * 10**9]
+    events = make_events([(t, 3, k, 1 - k % 2 * 2) for k, t in enumerate(times)], HEIGHT, WIDTH)
+    chunks = (slice_count(events, start, stop) for start, stop in ((0, 0), (0, 2), (2, 2), (2, 6)))
+    write(tmp_path / "whole", events, 6 * 10**9 + 1)
+    write(tmp_path / "chunks", chunks, None)
+    for name in ("whole", "chunks"):
+        read = read_recording(tmp_path / name).events
+        assert all(torch.equal(getattr(read, column), getattr(events, column)) for column in "txyp")
+    if write is write_hdf5:
+        with h5py.File(tmp_path / "whole") as whole, h5py.File(tmp_path / "chunks") as other:
+            assert np.array_equal(whole["ms_to_idx"], other["ms_to_idx"])
+            assert whole["ms_to_idx"][-1] == len(times)
+    else:
+        assert (tmp_path / "whole").read_bytes() == (tmp_path / "chunks").read_bytes()
+
+
+@pytest.mark.parametrize(("write", "times"), [
+    (write_hdf5, [-1]), (write_text, [-1]), (write_evt3, [-1, 0]), (write_hdf5, [0, 10**13]), (write_evt3, [10**13]),
+    (write_text, [5, 4]),
+])  # fmt: skip
+def test_times_that_a_format_cannot_hold_are_refused(write, times, make_events, tmp_path):
+    chunks = [make_events([(t, 1, 1, 1)], HEIGHT, WIDTH) for t in times]
+    with pytest.raises(ValueError, match="holds times from 0 to"):
+        write(tmp_path / "e", chunks, None)
 
 
 def test_evt3_refuses_a_sensor_with_more_columns_than_its_words_count(make_events, tmp_path):
