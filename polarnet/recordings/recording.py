@@ -191,6 +191,11 @@ def read_recording(
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a path is a file, or the folder of a bag."""
+    return path.is_file() or (path.is_dir() and rosbag.matches(path, b""))
+
+
 def detect_format(path: str | os.PathLike[str]) -> str:
     """Detect the format, a key of FORMATS, from a file's first bytes; RecordingError where none matches."""
     path, head = Path(path), b""
