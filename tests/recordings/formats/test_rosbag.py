@@ -69,7 +69,7 @@ def test_packets_of_event_camera_msgs_worked_out_by_hand(rosbags, tmp_path, read
 
 def test_packets_of_another_encoding_are_refused(rosbags, tmp_path):
     write_packets(tmp_path / "e", 8, 10, [("evt3", 0, bytes(4)), ("trigger", 0, bytes(8))])
-    with pytest.raises(RecordingError, match="expected packets of one encoding of evt3, .* libcaer_cmp, got 'trigger'"):
+    with pytest.raises(RecordingError, match=r"expected packets of one encoding of evt3, .*, got 'trigger'"):
         read_recording(tmp_path / "e")
 
 
