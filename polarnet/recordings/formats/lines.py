@@ -43,6 +43,7 @@ _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:true|false)")
 _POLARITY = re.compile(r"[+-]?[01](\.0*)?(e[+-]?0+)?|(?i:true|false)")
 _GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\W+(\d{1,5})")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
+_POWERS = 10 ** np.arange(_DIGITS + 1)
 _MAX_VALUE = 2**60
 _END, _COMMENTS = 10, (35, 37)  # line feed, # and %
 
@@ -202,7 +203,7 @@ def rows_of(
     buffer = np.frombuffer(data, np.uint8)
     start = 0
     while start < len(buffer):
-        rows = np.empty((BLOCK_EVENTS, len(shift)), np.int64)
+        rows = np.empty((len(shift), BLOCK_EVENTS), np.int64).T  # so that each column is contiguous
         filled, start, unreadable = _parse(buffer, start, shift, rows)
         counts[damage] += unreadable
         if filled:
@@ -256,13 +257,26 @@ def _number(buffer, place, shift):
             place += 1
         return np.int64(buffer[start] | 32 == 116), place, word
     negative = buffer[place] == 45
-    place += negative
-    value, first = 0, place
-    while place < size and 48 <= buffer[place] <= 57 and place - first < _DIGITS:
-        value = 10 * value + (buffer[place] - 48)
+    place += negative or buffer[place] == 43
+    value, first, decimals = 0, place, -1
+    while place < size and place - first < _DIGITS:  # a number without an exponent
+        digit = np.int64(buffer[place]) - 48
+        if 0 <= digit <= 9:
+            value = 10 * value + digit
+            decimals += decimals >= 0
+        elif digit == -2 and decimals < 0:
+            decimals = 0
+        else:
+            break
         place += 1
-    if shift == 0 and place > first and (place == size or _ends(buffer[place])):
-        return -value if negative else value, place, True
+    zeros = shift - max(decimals, 0)
+    if place > first + (decimals >= 0) and (place == size or _ends(buffer[place])) and place - first + zeros <= _DIGITS:
+        if zeros >= 0:
+            value *= _POWERS[zeros]
+            return -value if negative else value, place, True
+        if shift == 0 and value % _POWERS[-zeros] == 0:
+            value //= _POWERS[-zeros]
+            return -value if negative else value, place, True
     place = start + (negative or buffer[start] == 43)
     value, digits, count, exponent, point = 0, 0, 0, shift, False
     while place < size:
