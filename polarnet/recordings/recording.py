@@ -53,14 +53,17 @@ def signature(start: bytes) -> Callable[[Path, bytes], bool]:
 PART, CLOCK = ("part",), ("clock_mhz",)
 FORMATS = {
     "store": Format("our own event store", store.matches, store.open_store, takes=PART),
-    "e2p": Format("HDF5 of E2P, for the PDAVIS, and of v2e", hdf5.matcher("e2p"), hdf5.opener("e2p"), hdf5.e2p_frames),
-    "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matcher("esfp"), hdf5.opener("esfp")),
-    "metavision": Format("HDF5 of Prophesee", hdf5.matcher("metavision"), hdf5.opener("metavision")),
-    "monash": Format("HDF5 of Monash, E2VID and EVREAL", hdf5.matcher("monash"), hdf5.opener("monash")),
-    "m3ed": Format("HDF5 of M3ED", hdf5.matcher("m3ed"), hdf5.opener("m3ed"), takes=PART),
-    "mvsec": Format("HDF5 of MVSEC", hdf5.matcher("mvsec"), hdf5.opener("mvsec"), takes=PART),
+    **{
+        name: Format(
+            f"HDF5 of {layout.owner}",
+            hdf5.matcher(name),
+            hdf5.opener(name),
+            hdf5.e2p_frames if name == "e2p" else None,
+            takes=PART if len(layout.parts) > 1 else (),
+        )
+        for name, layout in hdf5.LAYOUTS.items()
+    },
     "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, takes=PART),
-    "dsec": Format("HDF5 of DSEC", hdf5.matcher("dsec"), hdf5.opener("dsec")),
     "aedat4": Format(
         "AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.open_aedat4, faery.aedat4_frames, takes=PART
     ),

@@ -84,7 +84,7 @@ def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, r
         (b"", "the file is empty"),
         (
             b"\x00\x01\x02\xff" * 100,
-            "of none of the formats store, e2p, esfp, metavision, monash, m3ed, mvsec, rosbag, dsec",
+            "of none of the formats store, e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag",
         ),
         (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
         (b"1,2,3,4,5,6\n", "of none of the formats"),

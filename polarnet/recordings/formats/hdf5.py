@@ -59,10 +59,10 @@ class Layout(NamedTuple):
 
 
 LAYOUTS = {
-    "e2p": Layout("E2P", [("events", number) for number in range(4)]),
-    "esfp": Layout("ESfP", [(name, None) for name in "txyp"]),
+    "e2p": Layout("E2P, for the PDAVIS, and of v2e", [("events", number) for number in range(4)]),
+    "esfp": Layout("ESfP, one sensor behind a rotating polarizer", [(name, None) for name in "txyp"]),
     "metavision": Layout("Prophesee", [("CD/events", name) for name in "txyp"]),
-    "monash": Layout("Monash", [(f"events/{name}s", None) for name in "txyp"], seconds=True),
+    "monash": Layout("Monash, E2VID and EVREAL", [(f"events/{name}s", None) for name in "txyp"], seconds=True),
     "m3ed": Layout(
         "M3ED",
         [(f"prophesee/{{}}/{name}", None) for name in "txyp"],
@@ -101,7 +101,7 @@ def opener(name: str) -> Callable[[Path, Choices], Source]:
         parts = _parts(layout, tables)
         if not parts:
             absent = ", ".join(table for table in dict(layout.of(layout.parts[0])) if table not in tables)
-            raise RecordingError(f"{path.name}: expected HDF5 in the layout of {layout.owner}, there is no {absent}")
+            raise RecordingError(f"{path.name}: expected HDF5 of {layout.owner}: there is no {absent}")
         part = parts[0] if parts == [""] else chosen_part(path, choices.part, parts, "camera")
         columns = layout.of(part)
         lengths = [_length(path, tables, *column) for column in columns]

@@ -250,52 +250,31 @@ def _parse(buffer, start, shift, rows):
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
-    if buffer[place] | 32 == 116 or buffer[place] | 32 == 102:  # True or False
-        end = place + (4 if buffer[place] | 32 == 116 else 5)
-        word = shift == 0 and end <= size and buffer[end - 1] | 32 == 101 and (end == size or _ends(buffer[end]))
+    letter = buffer[place] | 32
+    if letter == 116 or letter == 102:  # True or False
         while place < size and not _ends(buffer[place]):
             place += 1
-        return np.int64(buffer[start] | 32 == 116), place, word
+        return np.int64(letter == 116), place, shift == 0 and place - start == (4 if letter == 116 else 5)
     negative = buffer[place] == 45
     place += negative or buffer[place] == 43
-    value, first, decimals = 0, place, -1
-    while place < size and place - first < _DIGITS:  # a number without an exponent
-        digit = np.int64(buffer[place]) - 48
-        if 0 <= digit <= 9:
-            value = 10 * value + digit
-            decimals += decimals >= 0
-        elif digit == -2 and decimals < 0:
-            decimals = 0
-        else:
-            break
-        place += 1
-    zeros = shift - max(decimals, 0)
-    if place > first + (decimals >= 0) and (place == size or _ends(buffer[place])) and place - first + zeros <= _DIGITS:
-        if zeros >= 0:
-            value *= _POWERS[zeros]
-            return -value if negative else value, place, True
-        if shift == 0 and value % _POWERS[-zeros] == 0:
-            value //= _POWERS[-zeros]
-            return -value if negative else value, place, True
-    place = start + (negative or buffer[start] == 43)
     value, digits, count, exponent, point = 0, 0, 0, shift, False
     while place < size:
-        code = buffer[place]
-        if 48 <= code <= 57:
+        digit = np.int64(buffer[place]) - 48
+        if 0 <= digit <= 9:
             count += 1
             if digits < _DIGITS:
-                value = 10 * value + (code - 48)
+                value = 10 * value + digit
                 digits += value > 0
                 exponent -= point
             else:
                 exponent += not point
-        elif code == 46 and not point:
+        elif digit == -2 and not point:
             point = True
         else:
             break
         place += 1
     good = count > 0
-    if place < size and (buffer[place] == 101 or buffer[place] == 69):
+    if place < size and buffer[place] | 32 == 101:  # an exponent
         place += 1
         sign = -1 if place < size and buffer[place] == 45 else 1
         place += place < size and (buffer[place] == 45 or buffer[place] == 43)
@@ -305,18 +284,15 @@ def _number(buffer, place, shift):
             place += 1
         good = good and place > first
         exponent += sign * power
-    while exponent > 0 and value != 0 and good:
-        good = value < _MAX_VALUE // 10
-        value, exponent = 10 * value, exponent - 1
-    tenths = 0
-    while exponent < 0 and value != 0:
-        good = good and (shift > 0 or value % 10 == 0)
-        tenths = value % 10
-        value, exponent = value // 10, exponent + 1
-    value += tenths >= 5
-    good = good and value < _MAX_VALUE
+    if exponent > 0 and value:
+        good = good and exponent <= _DIGITS and value < _MAX_VALUE // _POWERS[min(exponent, _DIGITS)]
+        value *= _POWERS[min(exponent, _DIGITS)]
+    elif exponent < 0 and value:
+        unit = _POWERS[min(-exponent, _DIGITS)] if exponent >= -_DIGITS else _MAX_VALUE * 4
+        good = good and (shift > 0 or value % unit == 0)
+        value = value // unit + (value % unit >= unit - unit // 2)
+    good = good and (place == size or _ends(buffer[place]))
     while place < size and not _ends(buffer[place]):
-        good = False
         place += 1
     return -value if negative else value, place, good
 
