@@ -38,7 +38,7 @@ MICROSECONDS = 6  # decimals of a second
 TELLING_TIMES = 4  # different times that tell seconds from microseconds
 MAX_SEARCHED = 2**20  # lines searched for them: a simulated camera's first events may all be at time 0
 
-_SEPARATORS = re.compile(rb"[,;\s]+")
+_SEPARATORS, _COMMENT = re.compile(rb"[,;\s]+"), re.compile(rb"[#%]")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:true|false)")
 _POLARITY = re.compile(r"[+-]?[01](\.0*)?(e[+-]?0+)?|(?i:true|false)")
 _GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\W+(\d{1,5})")
@@ -134,12 +134,12 @@ def _in_seconds(path: Path, start: int, place: int) -> bool:
         file.seek(start)
         for line in itertools.islice(iter(lambda: file.readline(MAX_LINE), b""), MAX_SEARCHED):
             words = words_of(line)
-            if len(words) == len(COLUMNS) and _NUMBER.fullmatch(words[place]):
+            if len(words) == len(COLUMNS) and not words[place].isalpha() and _NUMBER.fullmatch(words[place]):
                 times.setdefault(float(words[place]), words[place])
-                if len(times) == TELLING_TIMES or not float(words[place]).is_integer():
-                    break
-    if len(times) == TELLING_TIMES or not all(map(float.is_integer, times)):
-        return not all(map(float.is_integer, times))
+                if not float(words[place]).is_integer():
+                    return True
+                if len(times) == TELLING_TIMES:
+                    return False
     return any(b"." in word and b"e" not in word.lower() for word in times.values())
 
 
@@ -183,7 +183,7 @@ def numbers_of(head: bytes) -> list[Line]:
         place += len(line)
         if len(line) == len(head) > MAX_LINE // 2 or (place == len(head) and numbers and not line.endswith(b"\n")):
             break  # cut off at the end of the head
-        words = words_of(re.split(rb"[#%]", line)[0])
+        words = words_of(line)
         if words and all(map(_NUMBER.fullmatch, words)):
             numbers.append(Line([word.decode() for word in words], place))
         elif words:
@@ -192,8 +192,8 @@ def numbers_of(head: bytes) -> list[Line]:
 
 
 def words_of(line: bytes) -> list[bytes]:
-    """The words between blanks, commas and semicolons."""
-    return [word for word in _SEPARATORS.split(line) if word]
+    """The words between blanks, commas and semicolons, before a comment."""
+    return [word for word in _SEPARATORS.split(_COMMENT.split(line, 1)[0]) if word]
 
 
 def rows_of(
