@@ -121,8 +121,8 @@ def unpacked(path: Path) -> Iterator[Any]:
                     )
                 file = stack.enter_context(archive.open(members[0]))
             yield file
-        except (EOFError, zlib.error, gzip.BadGzipFile, zipfile.BadZipFile, NotImplementedError) as error:
-            raise RecordingError(f"{path.name}: the archive is damaged: {error}") from error
+        except (EOFError, zlib.error, gzip.BadGzipFile, zipfile.BadZipFile, RuntimeError) as error:
+            raise RecordingError(f"{path.name}: the archive cannot be unpacked: {error}") from error
 
 
 def byte_blocks(path: Path, start: int, size: int, counts: Counter[str]) -> Iterator[bytearray]:

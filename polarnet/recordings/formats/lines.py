@@ -133,13 +133,12 @@ def _in_seconds(path: Path, start: int, place: int) -> bool:
     with unpacked(path) as file:
         file.seek(start)
         for line in itertools.islice(iter(lambda: file.readline(MAX_LINE), b""), MAX_SEARCHED):
-            words = words_of(line)
-            if len(words) == len(COLUMNS) and not words[place].isalpha() and _NUMBER.fullmatch(words[place]):
-                times.setdefault(float(words[place]), words[place])
-                if not float(words[place]).is_integer():
-                    return True
-                if len(times) == TELLING_TIMES:
-                    return False
+            word = words[place] if len(words := words_of(line)) == len(COLUMNS) else b""
+            if word.isalpha() or not _NUMBER.fullmatch(word) or not abs(float(word)) < _MAX_VALUE:
+                continue
+            times.setdefault(float(word), word)
+            if not float(word).is_integer() or len(times) == TELLING_TIMES:
+                return not float(word).is_integer()
     return any(b"." in word and b"e" not in word.lower() for word in times.values())
 
 
