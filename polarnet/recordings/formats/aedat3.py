@@ -40,9 +40,9 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
     header, _, ended = header_lines(path, b"#", LAST_LINE, MAX_HEADER_BYTES)
     if not ended:
         raise RecordingError(f"{path.name}: expected AEDAT 3.1's header of # lines up to {LAST_LINE.decode()}")
-    if (form := re.search(rb"#Format: *(\S+)", header)) and form[1] != b"RAW":
+    if (form := re.search(rb"#Format: *([\w, ]+)", header)) and form[1] != b"RAW":
         raise RecordingError(
-            f"{path.name}: expected AEDAT 3.1 of format RAW, got {form[1].decode('ascii', 'replace')}; convert it with DV"
+            f"{path.name}: expected AEDAT 3.1 of format RAW, got {form[1].decode()}; convert it with DV"
         )
     names = {number.decode(): name for number, name in re.findall(rb"#Source (\d+): *(\S+)", header)}
     source = chosen_part(path, choices.part, list(names), "source of events")
