@@ -56,7 +56,7 @@ def write_bag(
         return kinds[array](header=stamp, height=height, width=width, events=events)
 
     serialize = store.serialize_ros1 if old else store.serialize_cdr
-    with Writer1(path) if old else Writer2(path, version=9, storage_plugin=StoragePlugin(plugin)) as bag:
+    with Writer1(path) if old else Writer2(path, version=9, storage_plugin=StoragePlugin[plugin.upper()]) as bag:
         for topic in topics:
             connection = bag.add_connection(topic, array, typestore=store)
             for k, some in enumerate((rows[:-1], rows[-1:])):

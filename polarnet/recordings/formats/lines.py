@@ -41,7 +41,7 @@ MAX_SEARCHED = 2**20  # lines searched for them: a simulated camera's first even
 _SEPARATORS, _COMMENT = re.compile(rb"[,;\s]+"), re.compile(rb"[#%]")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:true|false)")
 _POLARITY = re.compile(r"[+-]?[01](\.0*)?(e[+-]?0+)?|(?i:true|false)")
-_GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\W+(\d{1,5})")
+_GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\D(\d{1,5})")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
 _POWERS = 10 ** np.arange(_DIGITS + 1)
 _MAX_VALUE = 2**60
@@ -99,7 +99,9 @@ def _layout_of(head: bytes) -> _Layout:
         (size, end), *lines = lines
         start += end
     if order is None:
-        order = _order_of([line.words for line in lines]) if lines else COLUMNS if size or not head.strip() else None
+        order = _order_of([line.words for line in lines])
+    if order is None and (size or not head.strip()):
+        order = COLUMNS
     return _Layout(order, start, size, len(lines[0].words) if lines else len(COLUMNS))
 
 

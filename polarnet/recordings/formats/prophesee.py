@@ -31,8 +31,8 @@ from polarnet.recordings.source import (
 PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
 EVT_BLOCK_WORDS = 2**17
-SENSORS = {rb"gen ?3|generation 3": (480, 640), rb"gen ?4|imx6|generation 4": (720, 1280), rb"genx320": (320, 320)}
-"""Height and width by the sensor's name or generation in the header of EVT; files of 2020 state nothing else."""
+SENSORS = {(480, 640): (b"gen3", b"3"), (720, 1280): (b"gen4|imx6", b"4"), (320, 320): (b"genx320", b"none")}
+"""Sensors' names and generation by height and width, in headers of EVT; files of 2020 state nothing else."""
 SYSTEMS = {
     (480, 640): (21, 23, 25, 28, 29, 33, 34, 35, 40, 41),
     (720, 1280): (26, 30, 31, 32, 39, 46, 48, 49, 50, 52, 53, 54, 58, 66),
@@ -125,8 +125,9 @@ def _evt_size(header: bytes) -> tuple[int | None, int | None]:
     height, width = (re.search(name + rb"=(\d{1,5})", header) for name in (b"height", b"width"))
     if height and width:
         return int(height[1]), int(width[1])
-    for name, size in SENSORS.items():
-        if re.search(rb"(?i)% (?:plugin_name|sensor_name|sensor_generation)[^\n]*?(?:" + name + rb")", header):
+    for size, (names, generation) in SENSORS.items():
+        named = rb"(?:plugin|sensor)_name [^\n]*(?:" + names + rb")|sensor_generation " + generation
+        if re.search(rb"(?i)% (?:" + named + rb")", header):
             return size
     system = _system_id(header)
     return next((size for size, systems in SYSTEMS.items() if system in systems), (None, None))
