@@ -4,8 +4,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 EVENT = "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity"
 EVENT_ARRAY = "std_msgs/Header header\nuint32 height\nuint32 width\nEvent[] events"
+EVENT_PACKET = """std_msgs/Header header
+uint32 height
+uint32 width
+uint64 seq
+uint64 time_base
+string encoding
+bool is_bigendian
+uint8[] events"""
 ROS1_TIME = "time"
 
 
@@ -17,9 +27,14 @@ def write_bag(
     topics: Sequence[str] = ("/dvs/events",),
     form: str = "ros1",
     package: str = "dvs_msgs",
+    plugin: str = "sqlite3",
 ) -> None:
-    """Write rows t (microseconds), x, y, p to each topic: a message with all but the last, and one with the last."""
+    """Write rows t (microseconds), x, y, p to each topic: a message with all but the last, and one with the last.
+
+    `form` is ros1 or ros2; `plugin` the storage of ROS 2, sqlite3 or mcap.
+    """
     from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -41,8 +56,27 @@ def write_bag(
         return kinds[array](header=stamp, height=height, width=width, events=events)
 
     serialize = store.serialize_ros1 if old else store.serialize_cdr
-    with Writer1(path) if old else Writer2(path, version=9) as bag:
+    with Writer1(path) if old else Writer2(path, version=9, storage_plugin=StoragePlugin[plugin.upper()]) as bag:
         for topic in topics:
             connection = bag.add_connection(topic, array, typestore=store)
             for k, some in enumerate((rows[:-1], rows[-1:])):
                 bag.write(connection, k, serialize(message(some), array))
+
+
+def write_packets(path: Path, height: int, width: int, packets: Sequence[tuple[str, int, bytes]]) -> None:
+    """Write a ROS 2 bag of EventPacket of event_camera_msgs: encoding, time base and content of each."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "event_camera_msgs/msg/EventPacket"
+    store.register(get_types_from_msg(EVENT_PACKET, name))
+    kinds = store.types
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/event_camera/events", name, typestore=store)
+        for k, (encoding, time_base, content) in enumerate(packets):
+            stamp = kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+            header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+            data = np.frombuffer(content, np.uint8)
+            packet = kinds[name](header, height, width, k, time_base, encoding, False, data)
+            bag.write(connection, k, store.serialize_cdr(packet, name))

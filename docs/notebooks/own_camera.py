@@ -25,7 +25,7 @@ if recording is None:
     photograph = str(BUILTIN_PHOTOS[2].path)
     size = ["ingest.height=256", "ingest.width=384", "synthesize.sensor_height=128", "synthesize.sensor_width=192"]
     settings = ["polarizers=micropolarizers", "synthesize.duration_s=0.4", *size]
-    assert main(["simulate", photograph, *settings, "--format", "evt3", "--no-preview", "--out", "simulated"]) == 0
+    assert main(["simulate", photograph, *settings, "--to", "evt3", "--no-preview", "--out", "simulated"]) == 0
     recording = next(Path("simulated").glob("sensor*.raw"))
 
 # %% [markdown]

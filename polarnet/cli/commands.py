@@ -91,7 +91,7 @@ def _stores(command: AddCommand) -> None:
         description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
     )
     view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
-    view.add_argument("--sequence", nargs="+", default=[], metavar="NAME", help="sequences (default: the first twelve)")
+    view.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
     _reading(view)
@@ -135,7 +135,7 @@ def _simulate(command: AddCommand) -> None:
         "simulate.simulate",
         "make polarization events from a photograph, a video or measured polarization",
         "simulate lake.jpg sensor=noisy synthesize.duration_s=2",
-        "simulate walk.mp4 --size 240 320 --upsample --format store evt3",
+        "simulate walk.mp4 --size 240 320 --upsample --to store evt3",
         "simulate frames/ --fps 100 polarizers=micropolarizers readout.max_events_per_s=5e6",
         'simulate dofp.mp4 --mosaic "90 45 / 135 0" --out outputs/dofp',
         description="""\
@@ -150,7 +150,7 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     add = simulate.add_argument
     add("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
-    add("--format", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
+    add("--to", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
     add("--fps", type=float, metavar="HZ", help="frames a second (default: as a video states)")
     add(
         "--times", type=Path, metavar="FILE", help="a line with the time of each frame (default: FOLDER/timestamps.txt)"
@@ -174,12 +174,11 @@ def _inspect(command: AddCommand) -> None:
         "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
         "inspect recording.aedat4",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs. Of a "
-        "store it names the sequences.",
+        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs, and "
+        "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
     )
     inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
     _reading(inspect)
-    inspect.add_argument("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel of an event store: NAME/45")
     inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
 
 
@@ -199,7 +198,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
 - one file of a camera behind a rotating polarizer, with --rotating or --triggers
-- an event store, or a folder that `polarnet convert` or `polarnet simulate --format hdf5` wrote
+- an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
 - a folder of division-of-time captures
 - with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera
@@ -258,7 +257,6 @@ def _convert(command: AddCommand) -> None:
     add("--to", choices=("evt3", "hdf5", "text"), help="format (default: by the suffix of OUT; of a store: hdf5)")
     add("--start", metavar="TIME", help="start of the span after the first event: 500ms (default: 0s)")
     add("--stop", metavar="TIME", help="end of the span after the first event, exclusive")
-    add("--part", metavar="PART", help="SEQUENCE/ANGLE of an event store, or topic of a bag")
     add("--sequence", nargs="+", metavar="NAME", help="sequences of an event store (default: all)")
     _reading(convert)
 
@@ -287,7 +285,6 @@ def _fit_sensor(command: AddCommand) -> None:
     add("--contrast", type=float, metavar="C", help="contrast of the flicker, (max - min) / (max + min)")
     add("--frequency", type=float, nargs="+", metavar="HZ", help="frequency of each flicker recording")
     add("--flicker-light", type=float, default=127.5, metavar="DN", help="mean of the flicker (default: 127.5)")
-    add("--part", metavar="SEQUENCE/ANGLE", help="sequence and channel, if the files are event stores")
     _reading(fit)
 
 
@@ -351,7 +348,10 @@ def _cleaning(command: Command) -> None:
 
 def _reading(command: Command) -> None:
     """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
-    command.add_argument("--format", help="format if it cannot be recognised: text, celex5_csv, celex5_bin, dat, ...")
+    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
+    command.add_argument(
+        "--part", help="of a file with several: topic of a bag, stream of AEDAT, SEQUENCE/ANGLE of an event store"
+    )
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
     command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
     command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")

@@ -16,7 +16,7 @@ from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
-from polarnet.recordings.recording import detect_format, open_recording
+from polarnet.recordings.recording import detect_format, is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
@@ -32,7 +32,7 @@ RECONSTRUCT = "highpass"
 NETWORK_WINDOW = "33.333ms"
 ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
 """Options that say where the polarizers are."""
-NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", *READING)
+NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", "part", *READING)
 NOT_ROTATING = (
     "angles", "mosaic", "sequence", "truth", "method", "weights", "thresholds", "binning", "window", *CLEANING,
 )  # fmt: skip
@@ -93,7 +93,7 @@ def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | Non
     if options.rotating is None and options.triggers is None:
         return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
-    open_file = functools.partial(open_recording, **reading_of(options))
+    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
     source, rotation = open_rotating(Path(options.input[0]), rotation, open_file, options.size)
     return source, rotation, half_turn_rule(rotation, step_us)
 
@@ -104,7 +104,7 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
         return open_live(options.input[0], mosaic, options.idle, cleaner)
     method = METHODS.get(options.method)
     plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
-    open_file = functools.partial(open_recording, **reading_of(options))
+    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
     paths = [Path(path) for path in options.input]
     files = Files(paths, options.angles, mosaic, options.sequence, plain, open_file, config.recordings)
     return open_files(files, work, options.size, cleaner)
@@ -137,5 +137,9 @@ def check_options(options: argparse.Namespace) -> None:
         refuse(options, "without --rotating or --triggers", ["start_angle"])
     if (options.live or rotating) and len(options.input) != 1:
         raise ValueError(f"{'--live' if options.live else '--rotating'}: expected one input, got {len(options.input)}")
-    if Path(options.input[0]).is_dir():
-        refuse(options, "a store or a folder", READING)
+    if not Path(options.input[0]).is_dir() or is_recording(Path(options.input[0])):
+        refuse(options, "a recording", ["sequence"])
+    elif rotating or options.mosaic is not None:
+        refuse(options, "a store", READING)
+    else:
+        refuse(options, "a store or a folder", ["part", *READING])

@@ -48,10 +48,10 @@ def demo(options: argparse.Namespace) -> int:
 
 def simulate(options: argparse.Namespace) -> None:
     """Simulate, write the files and print facts about them."""
-    words = [*options.words, *options.format, *options.overrides]
+    words = [*options.words, *options.to, *options.overrides]
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     inputs = [Path(word).resolve() for word in options.words if word not in overrides]
-    formats = list(dict.fromkeys(word for word in options.format if word not in overrides)) or [STORE]
+    formats = list(dict.fromkeys(word for word in options.to if word not in overrides)) or [STORE]
     _check(options, inputs, overrides, formats)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
@@ -94,7 +94,7 @@ class Times(NamedTuple):
 
 def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str], formats: list[str]) -> None:
     if unknown := [form for form in formats if form not in FORMATS]:
-        raise ValueError(f"--format: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
+        raise ValueError(f"--to: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
     if "hdf5" in formats:
         h5py_module()  # where it is missing, say so before the simulation
     if not inputs:

@@ -8,17 +8,17 @@ import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.cli.options import reading_of
+from polarnet.cli.options import READING, reading_of, refuse
 from polarnet.config.origins import origin_problems
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
-from polarnet.recordings.noise import HOT_FACTOR
-from polarnet.recordings.recording import open_recording, read_recording
+from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
+from polarnet.recordings.recording import is_recording, open_recording, read_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
 from polarnet.reports.recordings import draw_hot_pixels, recording_picture
-from polarnet.reports.viewing import films_of
+from polarnet.reports.viewing import films_of, recording_film
 from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, SplitStore
@@ -36,6 +36,7 @@ UNFINISHED = (".tmp", ".partial", ".old")
 def inspect(options: argparse.Namespace) -> None:
     """Print a summary of a camera's file and draw it, or list the sequences of a store."""
     if options.part is None and is_store(options.file):
+        refuse(options, "a store without --part", READING)
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
@@ -47,12 +48,20 @@ def inspect(options: argparse.Namespace) -> None:
     print(f"picture     {folder / file.name}.png")
     if inspection.hot.any():
         draw_hot_pixels(inspection.counts, inspection.hot, folder / f"{file.name}.hot.png")
+        write_hot_pixels(folder / f"{file.name}.hot.txt", inspection.hot)
         print(f"hot pixels  {folder / file.name}.hot.png")
+        print(f"list        {folder / file.name}.hot.txt, for --hot-pixels")
 
 
 def view(options: argparse.Namespace) -> None:
     """Write a page that plays a store, a recording or a recovery, and open it."""
-    films = films_of(options.path, options.sequence, functools.partial(read_recording, **reading_of(options)))
+    read = functools.partial(read_recording, part=options.part, **reading_of(options))
+    if options.part is not None or is_recording(options.path):
+        refuse(options, "a recording", ["sequence"])
+        films = [recording_film(options.path, read)]
+    else:
+        refuse(options, "a store or a folder", READING)
+        films = films_of(options.path, options.sequence or ())
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)
     write_player(page, f"{options.path}", films, {"command": f"polarnet view {options.path}"})

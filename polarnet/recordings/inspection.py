@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int64, UInt16
 
 from polarnet.events.stream import Events
 from polarnet.recordings.formats.celex5 import celex5_pictures
-from polarnet.recordings.noise import event_counts, hot_pixels
+from polarnet.recordings.noise import hot_pixels
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS
 
@@ -54,11 +54,12 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
     size = max(1, round(EVENTS_PER_PIXEL * counts.size))
     start_us = stop_us = gap_us = gap_start_us = 0
     busiest, least = Events.empty(reader.height, reader.width), (True, np.inf)
+    began = False
     for events in reader.chunks(size):
         t = events.t.numpy()
         first, last = int(t[0]), int(t[-1])
-        start_us, stop_us = (start_us, stop_us) if counts.any() else (first, first)
-        counts += event_counts(events)
+        start_us, stop_us, began = (start_us, stop_us, True) if began else (first, first, True)
+        np.add.at(counts.reshape(-1), (events.y.long() * reader.width + events.x).numpy(), 1)
         on += int((events.p > 0).sum())
         silences = np.diff(t, prepend=stop_us)
         longest = int(silences.argmax())

@@ -147,6 +147,11 @@ def read_hot_pixels(path: Path, height: int, width: int) -> Bool[np.ndarray, "h 
     return bad
 
 
+def write_hot_pixels(path: Path, hot: Bool[np.ndarray, "h w"]) -> None:
+    """Write the file that `read_hot_pixels` reads."""
+    path.write_text("".join(f"{x} {y}\n" for y, x in np.argwhere(hot)), encoding="utf-8")
+
+
 def without_background(events: Events, within_us: int, last_us: np.ndarray) -> Events:
     """Events that a neighbour supports: one of the 8 pixels around fired at most `within_us` before.
 

@@ -8,12 +8,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
-from polarnet.events.stream import MAX_SIDE, Events, concatenate
-from polarnet.recordings.formats import aedat2, celex5, faery, hdf5, lines, prophesee, rosbag, store
+from polarnet.events.stream import MAX_SIDE, Events
+from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag, store
 from polarnet.recordings.repair import HARMLESS, repaired
-from polarnet.recordings.source import REPAIRS, Block, CameraFrames, Choices, RecordingError, Source, joined
+from polarnet.recordings.source import (
+    GZIP,
+    REPAIRS,
+    ZIP,
+    Block,
+    CameraFrames,
+    Choices,
+    RecordingError,
+    Source,
+    joined,
+    start_of,
+)
 
 CHUNK_EVENTS = 2**20
 
@@ -29,6 +41,8 @@ class Format(NamedTuple):
     open: Callable[[Path, Choices], Source]
     frames: Callable[[Path], CameraFrames] | None = None
     """Read the frames that the camera recorded beside its events; None for formats without frames."""
+    takes: tuple[str, ...] = ()
+    """Choices that have a meaning for the format, beside height and width: `part`, `clock_mhz`."""
 
 
 def signature(start: bytes) -> Callable[[Path, bytes], bool]:
@@ -36,25 +50,37 @@ def signature(start: bytes) -> Callable[[Path, bytes], bool]:
     return lambda path, head: head.startswith(start)
 
 
+PART, CLOCK = ("part",), ("clock_mhz",)
 FORMATS = {
-    "store": Format("our own event store", store.matches, store.open_store),
-    "e2p": Format("HDF5 of E2P, for the PDAVIS", hdf5.matcher("e2p"), hdf5.opener("e2p"), hdf5.e2p_frames),
-    "esfp": Format("HDF5 of ESfP, one sensor behind a rotating polarizer", hdf5.matcher("esfp"), hdf5.opener("esfp")),
-    "metavision": Format("HDF5 of Prophesee", hdf5.matcher("metavision"), hdf5.opener("metavision")),
-    "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag),
-    "dsec": Format("HDF5 of DSEC", hdf5.matcher("dsec"), hdf5.opener("dsec")),
-    "aedat4": Format("AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.opener("aedat"), faery.aedat4_frames),
+    "store": Format("our own event store", store.matches, store.open_store, takes=PART),
+    **{
+        name: Format(
+            f"HDF5 of {layout.owner}",
+            hdf5.matcher(name),
+            hdf5.opener(name),
+            hdf5.e2p_frames if name == "e2p" else None,
+            takes=PART if len(layout.parts) > 1 else (),
+        )
+        for name, layout in hdf5.LAYOUTS.items()
+    },
+    "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, takes=PART),
+    "aedat4": Format(
+        "AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.open_aedat4, faery.aedat4_frames, takes=PART
+    ),
+    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, takes=PART),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
-    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.opener("es")),
+    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.open_event_stream),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),
-    "celex5_csv": Format("CSV of a CeleX-5", celex5.matches_csv, celex5.open_csv),
-    "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin),
+    "celex5_csv": Format("CSV of a CeleX-5", celex5.matches_csv, celex5.open_csv, takes=CLOCK),
+    "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin, takes=CLOCK),
 }
 """Ordered as they are tried on a file of unknown format."""
 FOLDERS = ("store", "rosbag")
 """Formats whose recordings may be folders."""
+PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_csv", "celex5_bin")
+"""Formats that are read from gzip and zip archives too."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +133,10 @@ def open_recording(
     """Open a file to read it chunk by chunk.
 
     `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
-    not state them. `part` is SEQUENCE/ANGLE of an event store, or a topic of a bag. `clock_mhz` is the clock of a
-    CeleX-5 whose file holds clock ticks. RecordingError where the format is unknown or the content cannot be events;
-    RuntimeError naming the package to install where an optional one is missing.
+    not state them. `part` is one of several recordings in a file: SEQUENCE/ANGLE of an event store, a topic of a bag, a
+    stream of AEDAT, `left` or `right` of M3ED and MVSEC. `clock_mhz` is the clock of a CeleX-5 whose file holds clock
+    ticks. RecordingError where the format is unknown, has no parts or the content cannot be events; RuntimeError naming
+    the package to install where an optional one is missing.
     """
     path = Path(path)
     if not path.exists():
@@ -125,6 +152,13 @@ def open_recording(
     form = detect_format(path) if format is None else format
     if form not in FORMATS:
         raise ValueError(f"expected a format of {', '.join(FORMATS)}, got {form!r}")
+    for name in {"part", "clock_mhz"} - {*FORMATS[form].takes}:
+        if getattr(choices, name) is not None:
+            raise RecordingError(
+                f"{path.name}: expected no {name}, which has no meaning for the format {form}; leave it out"
+            )
+    if form not in PACKABLE and path.is_file() and _packed(path):
+        raise RecordingError(f"{path.name}: expected the format {form} outside an archive; unpack it")
     return RecordingReader(path, form, FORMATS[form].open(path, choices), chunk_events)
 
 
@@ -146,9 +180,15 @@ def read_recording(
     tensor([3], dtype=torch.int16)
     """
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
-    chunks = list(reader)
+    columns = [np.empty(0, kind) for kind in (np.int64, np.int16, np.int16, np.int8)]
+    for chunk in reader:
+        for column, name in zip(columns, "txyp", strict=True):
+            count = len(column)
+            column.resize(count + len(chunk), refcheck=False)  # in place, so that events never lie in memory twice
+            column[count:] = getattr(chunk, name).numpy()
     log_repairs(reader)
-    events = concatenate(chunks) if chunks else Events.empty(reader.height, reader.width)
+    t, x, y, p = map(torch.from_numpy, columns)
+    events = Events(t, x, y, p, reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 
 
@@ -159,12 +199,16 @@ def log_repairs(reader: RecordingReader) -> None:
             logger.warning("%s: %d %s", reader.path.name, count, REPAIRS[kind])
 
 
+def is_recording(path: Path) -> bool:
+    """Whether a path is a file, or the folder of a bag."""
+    return path.is_file() or (path.is_dir() and rosbag.matches(path, b""))
+
+
 def detect_format(path: str | os.PathLike[str]) -> str:
     """Detect the format, a key of FORMATS, from a file's first bytes; RecordingError where none matches."""
     path, head = Path(path), b""
     if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(lines.HEAD_BYTES)
+        head = start_of(path, lines.HEAD_BYTES)
         if not head:
             raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
@@ -173,6 +217,11 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     raise RecordingError(
         f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"
     )
+
+
+def _packed(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(ZIP)).startswith((GZIP, ZIP))
 
 
 def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:

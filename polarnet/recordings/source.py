@@ -1,20 +1,30 @@
 """The interface of a file format's module: an opened file that yields its columns in blocks, unchanged."""
 
+import contextlib
+import gzip
+import itertools
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, no_type_check
 
+import numba
 import numpy as np
 
 from polarnet.events.stream import MAX_SIDE
 
 BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
+MAX_LISTED = 16  # parts of a recording in a message
 MAX_PIXELS = 2**24  # of a sensor; the largest event cameras have 1.3 million
 
 WRAP_US = 2**32  # range of 32-bit time stamps
+FOLLOWING = 8  # events that tell a wrap of the time stamps from one wrong stamp
+
+GZIP, ZIP = b"\x1f\x8b", b"PK\x03\x04"
 
 REPAIRS = {
     "unreadable_lines": "lines that are not the numbers they should be: left out",
@@ -67,7 +77,7 @@ class Choices:
     height: int | None = None
     width: int | None = None
     part: str | None = None
-    """SEQUENCE/ANGLE of an event store, or a topic of a bag."""
+    """SEQUENCE/ANGLE of an event store, a topic of a bag, a stream of AEDAT, or a camera of a file with two."""
     clock_mhz: float | int | None = None
     """Clock of a CeleX-5; None: 100 MHz in a BIN file, and times in microseconds in a CSV file."""
 
@@ -92,23 +102,67 @@ class CameraFrames(NamedTuple):
     """S0 (1 at saturation), DoLP and AoLP (radians, [0, pi)), n x height/2 x width/2 each, if the file has them."""
 
 
+@contextlib.contextmanager
+def unpacked(path: Path) -> Iterator[Any]:
+    """The binary content of a file, or of the one file in a gzip or zip archive; RecordingError for other archives."""
+    with contextlib.ExitStack() as stack:
+        file: Any = stack.enter_context(path.open("rb"))
+        magic = file.read(len(ZIP))
+        file.seek(0)
+        try:
+            if magic.startswith(GZIP):
+                file = stack.enter_context(gzip.open(file))
+            elif magic == ZIP:
+                archive = zipfile.ZipFile(file)
+                members = [
+                    one for one in archive.infolist() if not (one.is_dir() or one.filename.startswith("__MACOSX"))
+                ]
+                if len(members) != 1:
+                    raise RecordingError(
+                        f"{path.name}: expected one recording in the zip archive, got {len(members)} files; unpack it"
+                    )
+                file = stack.enter_context(archive.open(members[0]))
+            yield file
+        except (EOFError, zlib.error, gzip.BadGzipFile, zipfile.BadZipFile, RuntimeError) as error:
+            raise RecordingError(f"{path.name}: the archive cannot be unpacked: {error}") from error
+
+
+def byte_blocks(path: Path, start: int, size: int, counts: Counter[str]) -> Iterator[bytearray]:
+    """The content from byte `start` on, unpacked, `size` bytes at a time; a cut archive is counted as `cut_tail`."""
+    with unpacked(path) as file:
+        block = bytearray()
+        try:
+            file.seek(start)
+            while data := file.read1(size - len(block)):
+                block += data
+                if len(block) == size:
+                    yield block
+                    block = bytearray()
+        except EOFError:
+            counts["cut_tail"] += 1
+        if block:
+            yield block
+
+
+def start_of(path: Path, size: int) -> bytes:
+    """The first bytes of a file, unpacked."""
+    return bytes(next(byte_blocks(path, 0, size, Counter()), b""))
+
+
 def word_blocks(
     path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counter[str]
 ) -> Iterator[np.ndarray]:
     """The words of a file from byte `start` on, `words` at a time; a cut word at the end is counted as `cut_tail`."""
     size = np.dtype(dtype).itemsize
-    with path.open("rb") as file:
-        file.seek(start)
-        while data := file.read(words * size):
-            counts["cut_tail"] += len(data) % size != 0
-            if len(data) >= size:
-                yield np.frombuffer(data[: len(data) // size * size], dtype)
+    for data in byte_blocks(path, start, words * size, counts):
+        counts["cut_tail"] += len(data) % size != 0
+        if len(data) >= size:
+            yield np.frombuffer(data, dtype, len(data) // size)
 
 
 def header_lines(path: Path, prefix: bytes, last: bytes, max_bytes: int) -> tuple[bytes, bytes, bool]:
     """First lines of a file that begin with `prefix`, the two bytes after them, and whether `last` ends them."""
-    with path.open("rb") as file:
-        data = file.read(max_bytes)
+    data = start_of(path, max_bytes)
     start, ended = 0, False
     while not ended and data.startswith(prefix, start) and (end := data.find(b"\n", start)) >= 0:
         ended = data[start:end].strip() == last
@@ -117,14 +171,51 @@ def header_lines(path: Path, prefix: bytes, last: bytes, max_bytes: int) -> tupl
 
 
 def unwrapped(blocks: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Unwrapped times (int64) and entries of each block that is not empty; column `t` has 32-bit microseconds."""
-    turns, before = 0, 0
-    for block in blocks:
-        if len(block):
-            t = block["t"].astype(np.int64)
-            wraps = turns + np.cumsum(np.diff(t, prepend=before) < -WRAP_US // 2)
-            turns, before = int(wraps[-1]), int(t[-1])
-            yield t + wraps * WRAP_US, block
+    """Unwrapped times (int64) and entries of each block that is not empty; column `t` has 32-bit microseconds.
+
+    A stamp on the other side of the range is a wrap if most of the events after it are there too. Otherwise it is one
+    late or wrong stamp, and later times do not change.
+    """
+    state = None
+    for block, following in itertools.pairwise(itertools.chain((one for one in blocks if len(one)), [None])):
+        assert block is not None
+        after = block["t"][:0] if following is None else following["t"][:FOLLOWING]
+        t = np.concatenate([block["t"], after]).astype(np.int64)
+        state = np.array([0, np.median(t[: FOLLOWING + 1])], np.int64) if state is None else state
+        _unwrap(t, len(block), state)
+        yield t[: len(block)], block
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _unwrap(t, count, state):
+    """Add the wraps to the first `count` times; `state` holds the wraps and the last credible stamp."""
+    wraps, before = state
+    for i in range(count):
+        now = t[i]
+        step = now - before
+        wrap = 0
+        if abs(step) > WRAP_US // 2:
+            wrap = -1 if step > 0 else 1
+            after = t[i + 1 : i + 1 + FOLLOWING]
+            agree = np.sum(np.abs(after - before) > WRAP_US // 2)
+            if 2 * agree < len(after):
+                t[i] += (wraps + wrap) * WRAP_US
+                continue
+            wrap = max(wrap, 0)  # forwards, it is a pause
+        wraps += wrap
+        before = now
+        t[i] += wraps * WRAP_US
+    state[0], state[1] = wraps, before
+
+
+def chosen_part(path: Path, part: str | None, parts: Sequence[str], words: str) -> str:
+    """The part of a recording that the user names, or the only one; RecordingError that lists the parts otherwise."""
+    if part in parts or (part is None and len(parts) == 1):
+        return part or parts[0]
+    listed = ", ".join(parts[:MAX_LISTED]) + (", ..." if len(parts) > MAX_LISTED else "")
+    given = "" if part is None else f"; got {part!r}"
+    raise RecordingError(f"{path.name}: say which {words} to read, --part with one of {listed or 'none'}{given}")
 
 
 def sensor_size(path: Path, choices: Choices, height: int | None = None, width: int | None = None) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.arrangements import read_plain
-from polarnet.recordings.recording import Recording, read_recording
+from polarnet.recordings.recording import Recording, is_recording, read_recording
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, dequantise
@@ -26,20 +26,26 @@ APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "
 """Quantity of each array of recovered.zarr and truth.zarr."""
 
 
-def films_of(
-    path: Path, sequences: Sequence[str] = (), read: Callable[[Path], Recording] = read_recording
-) -> list[Film]:
-    """Films of a store, of a folder with stores (all of a sequence in one), or of a camera's file, which `read` reads.
+def recording_film(path: Path, read: Callable[[Path], Recording] = read_recording) -> Film:
+    """The film of a camera's file, which `read` reads."""
+    return _events_film(path.name, read_plain(path, read), None)
+
+
+def films_of(path: Path, sequences: Sequence[str] = ()) -> list[Film]:
+    """Films of a store, of a folder with stores (all of a sequence in one), or of a camera's file.
+
 
     Without `sequences`, the first `MAX_FILMS` of each store are read. ValueError for an unknown sequence;
     FileNotFoundError if there is nothing to show.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: expected a store, a folder with stores or a recording; there is no such path")
-    stores = [path] if not path.is_dir() or _is_store(path) else sorted(filter(_is_store, path.glob("*.zarr")))
+    if is_recording(path):
+        return [recording_film(path)]
+    stores = [path] if _is_store(path) else sorted(filter(_is_store, path.glob("*.zarr")))
     if not stores:
         raise FileNotFoundError(f"{path}: expected a folder that holds stores (*.zarr), found none")
-    parts = [film for store in stores for film in _films(store, sequences, read)]
+    parts = [film for store in stores for film in _films(store, sequences)]
     if not parts:
         raise FileNotFoundError(f"{path}: its stores hold no frame and no event")
     return _joined(parts)
@@ -65,10 +71,7 @@ def _joined(parts: Sequence[Film]) -> list[Film]:
     return list(films.values())
 
 
-def _films(path: Path, sequences: Sequence[str], read: Callable[[Path], Recording]) -> Iterator[Film]:
-    if not path.is_dir():
-        yield _events_film(path.name, read_plain(path, read), None)
-        return
+def _films(path: Path, sequences: Sequence[str]) -> Iterator[Film]:
     form = open_group(path).attrs.get("format")
     if form == EventStore.FORMAT:
         events, frames = EventStore.open(path), path.with_name("frames.zarr")

@@ -199,7 +199,7 @@ def test_sizes_polarizers_readout_and_upsampling_are_those_of_the_python_call():
 def test_files_for_other_tools_read_back_equal_one_a_sensor(form, suffix, capsys):
     write_video("walk.mp4", scenery(3))
     for layout in ("four_sensors", "dofp"):
-        given = ["--format", "store", form, f"polarizers.layout={layout}", "--no-preview", "seed=1"]
+        given = ["--to", "store", form, f"polarizers.layout={layout}", "--no-preview", "seed=1"]
         assert main(["simulate", "walk.mp4", "--out", layout, *given]) == 0
     files = [f"four_sensors/polarizer_{angle:03d}.{suffix}" for angle in POLARIZER_ANGLES_DEG]
     assert_equal([read_recording(file).events for file in files], stored("four_sensors"))
@@ -208,6 +208,19 @@ def test_files_for_other_tools_read_back_equal_one_a_sensor(form, suffix, capsys
     capsys.readouterr()
     assert main(["inspect", f"dofp/sensor.{suffix}"]) == 0
     assert f"{sum(map(len, stored('dofp'))):,}" in capsys.readouterr().out
+
+
+def test_recover_reads_the_store_and_its_files(capsys):
+    write_video("walk.mp4", np.concatenate([scenery(3, 32, 48), scenery(3, 32, 48)[::-1]]))
+    assert main(["simulate", "walk.mp4", "--out", "out", "--to", "store", "evt3", "--no-preview"]) == 0
+    raw = [f"out/polarizer_{angle:03d}.raw" for angle in POLARIZER_ANGLES_DEG]
+    wanted = ["--method", "highpass", "--write", "zarr", "--out"]
+    assert main(["recover", "out/events.zarr", *wanted, "a"]) == 0
+    assert main(["recover", *raw, "--angles", "0", "45", "90", "135", *wanted, "b"]) == 0
+    for name in "ab":
+        assert zarr.open_group(f"{name}/recovered.zarr", mode="r")["dolp"].shape[1:] == (32, 48)
+    counts = ", ".join(f"{len(e):,} at {angle}" for e, angle in zip(stored(), POLARIZER_ANGLES_DEG, strict=True))
+    assert capsys.readouterr().out.count(counts) == 3
 
 
 def test_interrupted_or_failed_runs_leave_an_earlier_run_and_nothing_else(tmp_path, monkeypatch, capsys):
@@ -276,7 +289,7 @@ FPS = ["--fps", "30"]
         ([*VIDEOS[:3], VIDEOS[0]], "one behind each of 0, 45, 90, 135"),
         (VIDEOS[:2], "expected one file or folder, or four videos"),
         (["lake.png", *FPS, "--upsample"], "expected no --fps, --upsample"),
-        (["walk.mp4", "--format", "aedat"], "expected some of store, hdf5, text, evt3, got aedat"),
+        (["walk.mp4", "--to", "aedat"], "expected some of store, hdf5, text, evt3, got aedat"),
         (["walk.mp4", "--white", "100"], "expected no --white"),
         (["walk.mp4", "--size", "48", "64"], "--size: expected at most the frames' 24 32"),
         (["walk.mp4", "emulate.contrast=1"], "emulate.contrast"),

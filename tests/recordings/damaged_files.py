@@ -33,6 +33,9 @@ DAMAGE = st.lists(
 )
 """Changes of a file in order: kind, byte, and value."""
 
+COLUMNS = {"esfp": "{}", "monash": "events/{}s", "m3ed": "prophesee/right/{}"}
+"""Tables of columns in HDF5 without the sensor's size."""
+
 ENDINGS = ("read", "repaired", "refused")
 """The only three that reading a file may have: as it is, with repairs that are counted, or with the reason not to."""
 
@@ -63,7 +66,8 @@ class Sample:
 
     def __init__(self, form: str, folder: Path, events: Events):
         self.form = form
-        self._size = {"height": events.height, "width": events.width} if form == "esfp" else {}  # the file has no size
+        sizeless = form in (*COLUMNS, "mvsec")
+        self._size = {"height": events.height, "width": events.width} if sizeless else {}
         self.path = folder / f"sample.{'bag' if form == 'rosbag' else form}"
         write_sample(form, self.path, events)
         self._files = sorted(path for path in [self.path, *self.path.rglob("*")] if path.is_file())
@@ -90,16 +94,18 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         store.finish()
     elif form == "dsec":
         write_hdf5(path, events, 400_000)
-    elif form in ("e2p", "esfp", "metavision"):
+    elif form in COLUMNS or form in ("e2p", "mvsec", "metavision"):
         h5py = pytest.importorskip("h5py")
         columns = {"t": events.t, "x": events.x, "y": events.y, "p": events.p > 0}
         with h5py.File(path, "w") as file:
             if form == "e2p":
                 file["events"] = np.stack([*columns.values()], axis=1).astype(np.uint32)
                 file.attrs["sensor_resolution"] = (events.width, events.height)
-            elif form == "esfp":
+            elif form == "mvsec":
+                file["davis/left/events"] = np.stack([columns[name] * 1.0 for name in "xytp"], axis=1)
+            elif form in COLUMNS:
                 for name, column in columns.items():
-                    file[name] = column.numpy()
+                    file[COLUMNS[form].format(name)] = column.numpy()
             else:
                 kinds = {"x": "<u2", "y": "<u2", "p": "<i2", "t": "<i8"}
                 table = np.zeros(len(events), [*kinds.items()])
@@ -127,6 +133,11 @@ def write_sample(form: str, path: Path, events: Events) -> None:
         words = np.stack([events.t, events.x.long() | events.y.long() << 14 | (events.p > 0).long() << 28], axis=1)
         header = f"% Version 2\n% Height {events.height}\n% Width {events.width}\n".encode()
         path.write_bytes(header + b"\x0c\x08" + words.astype("<u4").tobytes())
+    elif form == "aedat3":
+        data = 1 | (events.p > 0).long() << 1 | events.y.long() << 2 | events.x.long() << 17
+        header = struct.pack("<2h6i", 1, 0, 8, 4, 0, *[len(events)] * 3)
+        words = np.stack([data, events.t], axis=1).astype("<u4").tobytes()
+        path.write_bytes(b"#!AER-DAT3.1\n#Source 0: DAVIS346\n#!END-HEADER\n" + header + words)
     elif form == "aedat2":
         x, y = events.width - 1 - events.x.long(), events.height - 1 - events.y.long()  # events count from the right
         address = y << 22 | x << 12 | (events.p > 0).long() << 11

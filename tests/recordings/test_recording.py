@@ -1,3 +1,5 @@
+import gzip
+
 import numpy as np
 import pytest
 import torch
@@ -80,7 +82,10 @@ def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, r
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (b"\x00\x01\x02\xff" * 100, "of none of the formats store, e2p, esfp, metavision, rosbag, dsec"),
+        (
+            b"\x00\x01\x02\xff" * 100,
+            "of none of the formats store, e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag",
+        ),
         (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
         (b"1,2,3,4,5,6\n", "of none of the formats"),
     ],
@@ -111,5 +116,13 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "e.txt", **arguments)
     (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n")
+    for name, value in (("part", "left"), ("clock_mhz", 50)):
+        with pytest.raises(
+            RecordingError, match=rf"e\.txt: expected no {name}, which has no meaning for the format text"
+        ):
+            open_recording(tmp_path / "e.txt", **{name: value})
+    (tmp_path / "e.bag").write_bytes(gzip.compress(b"#ROSBAG V2.0\n"))
+    with pytest.raises(RecordingError, match=r"e\.bag: expected the format rosbag outside an archive; unpack it"):
+        open_recording(tmp_path / "e.bag")
     with pytest.raises(RecordingError, match="the file states a height of 12 px, 13 was given"):
         read_recording(tmp_path / "e.txt", height=13, width=18)

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size, start_of, unpacked
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
@@ -153,8 +153,7 @@ def open_csv(path: Path, choices: Choices) -> Source:
     Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
     selects this interpretation.
     """
-    with path.open("rb") as file:
-        lines = numbers_of(file.read(HEAD_BYTES))
+    lines = numbers_of(start_of(path, HEAD_BYTES))
     if lines and len(lines[0].words) != CSV_COLUMNS:
         raise RecordingError(
             f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
@@ -200,8 +199,7 @@ def _header(head: bytes) -> Header | None:
 
 
 def _opened(path: Path) -> Header:
-    with path.open("rb") as file:
-        header = _header(file.read(HEADER.size))
+    header = _header(start_of(path, HEADER.size))
     if header is None:
         raise RecordingError(f"{path.name}: expected the {HEADER.size} bytes of a BIN header of a CeleX-5 at its start")
     return header
@@ -210,7 +208,7 @@ def _opened(path: Path) -> Header:
 def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
     """The computer's time in milliseconds, and the bytes, of each package."""
     header = _opened(path)
-    with path.open("rb") as file:
+    with unpacked(path) as file:
         file.seek(HEADER.size)
         number = 0
         while start := file.read(LENGTH.size):

@@ -4,28 +4,43 @@ Its EVT3 decoder holds times back where the sensor's clock steps back, so `proph
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, chosen_part, sensor_size
 
 FAERY = Library("faery", "faery", "recordings", "the file is damaged")
 
 
-def opener(file_type: str) -> Callable[[Path, Choices], Source]:
-    """A function that opens AEDAT4's first event stream (`aedat`, microseconds since 1970), or Event Stream (`es`)."""
+def open_event_stream(path: Path, choices: Choices) -> Source:
+    """Open the events of Event Stream."""
 
-    def open_file(path: Path, choices: Choices) -> Source:
-        def blocks(counts: Counter[str]) -> Iterator[Block]:
-            for columns in ask(FAERY, path, isolated_worker.faery_events, file_type):
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for columns in ask(FAERY, path, isolated_worker.event_stream_events):
+            yield Block(*columns)
+
+    size = ask_once(FAERY, path, isolated_worker.event_stream_size)
+    return Source(*sensor_size(path, choices, *size), blocks)
+
+
+def open_aedat4(path: Path, choices: Choices) -> Source:
+    """Open a stream of events of AEDAT4, the only one or that of the number `part`; times are since 1970.
+
+    A file that ends within a packet is read up to there.
+    """
+    streams = ask_once(FAERY, path, isolated_worker.aedat4_streams)
+    stream = chosen_part(path, choices.part, list(streams), "stream of events")
+
+    def blocks(counts: Counter[str]) -> Iterator[Block]:
+        for columns in ask(FAERY, path, isolated_worker.aedat4_events, stream):
+            if columns is None:
+                counts["cut_tail"] += 1
+            else:
                 yield Block(*columns)
 
-        size = ask_once(FAERY, path, isolated_worker.faery_size, file_type)
-        return Source(*sensor_size(path, choices, *size), blocks)
-
-    return open_file
+    return Source(*sensor_size(path, choices, *streams[stream]), blocks)
 
 
 def aedat4_frames(path: Path) -> CameraFrames:

@@ -1,16 +1,25 @@
-"""HDF5 files in the layouts of `LAYOUTS`: where their columns t (whole microseconds), x, y and p (1 or 0) are."""
+"""HDF5 files in the layouts of `LAYOUTS`: where their columns t (microseconds, or seconds), x, y and p are."""
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import BLOCK_EVENTS, Block, CameraFrames, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    CameraFrames,
+    Choices,
+    RecordingError,
+    Source,
+    chosen_part,
+    sensor_size,
+)
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 TRIGGERS = "triggers"  # times of a trigger signal in microseconds
@@ -31,54 +40,92 @@ HDF5 = Library(
 Column = tuple[str, str | int | None]
 """A table, and the field of its records or the number of its column; None for a table of one column."""
 
-LAYOUTS: dict[str, tuple[str, list[Column]]] = {
-    "e2p": ("E2P", [("events", number) for number in range(4)]),
-    "esfp": ("ESfP", [(name, None) for name in "txyp"]),
-    "metavision": ("Prophesee", [("CD/events", name) for name in "txyp"]),
-    "dsec": ("DSEC", [(f"events/{name}", None) for name in "txyp"]),
+
+class Layout(NamedTuple):
+    """Where the columns t, x, y, p of a file are."""
+
+    owner: str
+    columns: Sequence[Column]
+    seconds: bool = False
+    """Whether times with a fraction are seconds."""
+    parts: Sequence[str] = ("",)
+    """Cameras of one file, whose names stand for {} in the tables."""
+    resolution: str = ""
+    """Table with the sensor's width and height."""
+
+    def of(self, part: str) -> list[Column]:
+        """The columns of a camera."""
+        return [(table.format(part), field) for table, field in self.columns]
+
+
+LAYOUTS = {
+    "e2p": Layout("E2P, for the PDAVIS, and of v2e", [("events", number) for number in range(4)]),
+    "esfp": Layout("ESfP, one sensor behind a rotating polarizer", [(name, None) for name in "txyp"]),
+    "metavision": Layout("Prophesee", [("CD/events", name) for name in "txyp"]),
+    "monash": Layout("Monash, E2VID and EVREAL", [(f"events/{name}s", None) for name in "txyp"], seconds=True),
+    "m3ed": Layout(
+        "M3ED",
+        [(f"prophesee/{{}}/{name}", None) for name in "txyp"],
+        parts=("left", "right"),
+        resolution="prophesee/{}/calib/resolution",
+    ),
+    "mvsec": Layout("MVSEC", [("davis/{}/events", k) for k in (2, 0, 1, 3)], seconds=True, parts=("left", "right")),
+    "dsec": Layout("DSEC", [(f"events/{name}", None) for name in "txyp"]),
 }
-"""Owner and columns t, x, y, p. E2P: Mei et al. 2023, a sensor behind polarizers 90 45 / 135 0. ESfP: Muglikar et al.
-2023. Prophesee: Metavision, whose compression ECF needs Prophesee's HDF5 plugin. DSEC: Gehrig et al. 2021, whose files
-do not state 480 x 640."""
+"""E2P: Mei et al. 2023, a sensor behind polarizers 90 45 / 135 0; v2e writes the same table. ESfP: Muglikar et al.
+2023. Prophesee: Metavision, whose compression ECF needs Prophesee's HDF5 plugin. Monash: Stoffregen et al. 2020, also
+of E2VID and EVREAL. M3ED: Chaney et al. 2023. MVSEC: Zhu et al. 2018. DSEC: Gehrig et al. 2021. The last two do not
+state 260 x 346 and 480 x 640."""
 
 
-def matcher(layout: str) -> Callable[[Path, bytes], bool]:
+def matcher(name: str) -> Callable[[Path, bytes], bool]:
     """A check of whether a file is HDF5 with the tables of a layout; for DSEC's, the last one tried, any HDF5."""
-    wanted = dict(LAYOUTS[layout][1]).keys()
 
     def matches(path: Path, head: bytes) -> bool:
-        if not head.startswith(MAGIC) or layout == "dsec":
+        if not head.startswith(MAGIC) or name == "dsec":
             return head.startswith(MAGIC)
         try:
-            return wanted <= _described(path)[0].keys()
+            return bool(_parts(LAYOUTS[name], _described(path)[0]))
         except (RecordingError, RuntimeError):
             return False  # the opener of DSEC's layout reports the reason
 
     return matches
 
 
-def opener(layout: str) -> Callable[[Path, Choices], Source]:
+def opener(name: str) -> Callable[[Path, Choices], Source]:
     """A function that opens the events of a file of a layout."""
-    owner, columns = LAYOUTS[layout]
+    layout = LAYOUTS[name]
 
     def open_file(path: Path, choices: Choices) -> Source:
         tables, settings = _described(path)
-        if absent := [name for name in dict(columns) if name not in tables]:
-            raise RecordingError(
-                f"{path.name}: expected HDF5 in the layout of {owner}, there is no {', '.join(absent)}"
-            )
+        parts = _parts(layout, tables)
+        if not parts:
+            absent = ", ".join(table for table in dict(layout.of(layout.parts[0])) if table not in tables)
+            raise RecordingError(f"{path.name}: expected HDF5 of {layout.owner}: there is no {absent}")
+        part = parts[0] if parts == [""] else chosen_part(path, choices.part, parts, "camera")
+        columns = layout.of(part)
         lengths = [_length(path, tables, *column) for column in columns]
         if len(set(lengths)) > 1:
             raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
         offset_us = _whole(path, "t_offset", settings.get("t_offset")) or 0
 
         def blocks(counts: Counter[str]) -> Iterator[Block]:
+            seconds: bool | None = None
             for t, x, y, p in _read(path, columns):
+                if seconds is None:
+                    seconds = layout.seconds and t.dtype.kind == "f" and not np.equal(t, np.floor(t)).all()
+                t = np.rint(t * 1e6) if seconds else t
                 yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
-        return Source(*sensor_size(path, choices, *_stated_size(path, settings)), blocks)
+        size = _stated_size(path, settings, settings.get(layout.resolution.format(part)))
+        return Source(*sensor_size(path, choices, *size), blocks)
 
     return open_file
+
+
+def _parts(layout: Layout, tables: Collection[str]) -> list[str]:
+    """The cameras whose tables are all there."""
+    return [part for part in layout.parts if dict(layout.of(part)).keys() <= set(tables)]
 
 
 def trigger_times_us(path: Path) -> np.ndarray:
@@ -116,9 +163,11 @@ def e2p_frames(path: Path) -> CameraFrames:
 
 def _described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Shape, number kind and fields of the tables of all layouts that the file has, and its `SETTINGS`."""
-    tables = [table for _, columns in LAYOUTS.values() for table, _ in columns]
-    names = [*tables, TRIGGERS, *E2P_FRAMES, *E2P_MAPS]
-    shapes, values = ask_once(HDF5, path, isolated_worker.hdf5_description, names, SETTINGS)
+    layouts = [(layout, part) for layout in LAYOUTS.values() for part in layout.parts]
+    names = [table for layout, part in layouts for table in dict(layout.of(part))]
+    settings = [*SETTINGS, *(layout.resolution.format(part) for layout, part in layouts if layout.resolution)]
+    names += [TRIGGERS, *E2P_FRAMES, *E2P_MAPS]
+    shapes, values = ask_once(HDF5, path, isolated_worker.hdf5_description, names, settings)
     return {name: (tuple(shape), kind, fields) for name, (shape, kind, fields) in shapes.items()}, values
 
 
@@ -138,14 +187,17 @@ def _length(path: Path, tables: dict[str, Any], name: str, part: str | int | Non
     return shape[0]
 
 
-def _stated_size(path: Path, settings: dict[str, Any]) -> tuple[int | None, int | None]:
-    """Height and width as the file states them: height and width, [width, height], or "WIDTHxHEIGHT"."""
+def _stated_size(path: Path, settings: dict[str, Any], resolution: Any) -> tuple[int | None, int | None]:
+    """Height and width as the file states them: two numbers, "WIDTHxHEIGHT", or a pair, whose larger is the width."""
     if geometry := re.fullmatch(r"(\d{1,5})x(\d{1,5})", str(settings.get("geometry"))):
         return int(geometry[2]), int(geometry[1])
-    width_height = settings.get("sensor_resolution", [settings.get("width"), settings.get("height")])
-    if not (isinstance(width_height, list) and len(width_height) == 2):
-        raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {width_height}")
-    width, height = (_whole(path, "the sensor's size", side) for side in width_height)
+    pair = settings.get("sensor_resolution", resolution)
+    if pair is None:
+        height, width = (_whole(path, "the sensor's size", settings.get(name)) for name in ("height", "width"))
+        return height, width
+    if not (isinstance(pair, list) and len(pair) == 2):
+        raise RecordingError(f"{path.name}: expected width and height as sensor_resolution, got {pair}")
+    height, width = sorted(side for one in pair if (side := _whole(path, "the sensor's size", one)) is not None)
     return height, width
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 GATHERED_EVENTS = 2**16  # per answer; the packets and messages of a file are small
+END_OF_FILE = "failed to fill whole buffer"  # faery's message where a packet is longer than what is left of the file
 
 
 def serve(pipe: Connection, max_mib: int) -> None:
@@ -86,7 +87,7 @@ def hdf5_description(path: str, tables: Sequence[str], attributes: Sequence[str]
         for key in attributes:
             if key in file.attrs:
                 values[key] = _plain(np.asarray(file.attrs[key]))
-            elif isinstance(scalar := file.get(key), dataset) and scalar.shape == ():
+            elif isinstance(scalar := file.get(key), dataset) and scalar.shape in ((), (1,), (2,)):
                 values[key] = _plain(np.asarray(scalar[()]))
     yield shapes, values
 
@@ -117,33 +118,66 @@ def _hdf5(path: str) -> Iterator[Any]:
 
 def _plain(value: np.ndarray) -> Any:
     """Python numbers for short numeric arrays, text for anything else."""
-    return value.tolist() if value.dtype.kind in "iuf" and value.size <= 8 else str(value)[:80]
+    if value.dtype.kind in "iuf" and value.size <= 8:
+        return value.tolist() if value.size != 1 else value.item()
+    value = value.item() if value.size == 1 else value
+    return (value.decode("ascii", "replace") if isinstance(value, bytes) else str(value))[:80]
 
 
-def faery_size(path: str, file_type: str) -> Iterator[tuple[int, int]]:
+def event_stream_size(path: str) -> Iterator[tuple[int, int]]:
     """Height and width of the sensor."""
     import faery
 
-    width, height = faery.events_stream_from_file(path, file_type=file_type).dimensions()
+    width, height = faery.events_stream_from_file(path, file_type="es").dimensions()
     yield height, width
 
 
-def faery_events(path: str, file_type: str) -> Iterator[list[np.ndarray]]:
+def event_stream_events(path: str) -> Iterator[list[np.ndarray]]:
     """Columns t, x, y and polarity (1 or 0) of the events."""
     import faery
 
-    for table in gathered(iter(faery.events_stream_from_file(path, file_type=file_type))):
-        yield [table["t"], table["x"], table["y"], table["on"].astype(np.uint8)]
+    yield from _columns(iter(faery.events_stream_from_file(path, file_type="es")))
+
+
+def aedat4_streams(path: str) -> Iterator[dict[str, tuple[int, int]]]:
+    """Height and width of each stream of events."""
+    import faery
+
+    tracks = [track for track in faery.aedat.Decoder(path).tracks() if track.data_type == "events"]
+    yield {str(track.id): (track.dimensions[1], track.dimensions[0]) for track in tracks}
+
+
+def aedat4_events(path: str, stream: str) -> Iterator[list[np.ndarray] | None]:
+    """Columns t, x, y and polarity (1 or 0) of the events of a stream; None at last if the file is cut."""
+    cut: list[str] = []
+    yield from _columns(packet for track, packet in _aedat4_packets(path, cut) if str(track.id) == stream)
+    if cut:
+        yield None
 
 
 def aedat4_frames(path: str) -> Iterator[tuple[np.ndarray, np.ndarray] | None]:
     """Times and grey levels of all frames; None if there are none, or if they differ in size."""
-    import faery
-
     times, levels = [], []
-    for track, packet in faery.aedat.Decoder(path):
+    for track, packet in _aedat4_packets(path, []):
         if track.data_type == "frame" and packet.pixels.ndim == 2:
             start, end = packet.exposure_start_t, packet.exposure_end_t
             times.append((start + end) // 2 if 0 < start < end else packet.t)
             levels.append(packet.pixels)
     yield (np.array(times), np.stack(levels)) if len({one.shape for one in levels}) == 1 else None
+
+
+def _aedat4_packets(path: str, cut: list[str]) -> Iterator[tuple[Any, Any]]:
+    """Streams and packets up to the end of the file, or to the place where it is cut, which is noted in `cut`."""
+    import faery
+
+    try:
+        yield from faery.aedat.Decoder(path)
+    except RuntimeError as error:
+        if END_OF_FILE not in str(error):
+            raise
+        cut.append(str(error))
+
+
+def _columns(tables: Iterator[np.ndarray]) -> Iterator[list[np.ndarray]]:
+    for table in gathered(tables):
+        yield [table["t"], table["x"], table["y"], table["on"].astype(np.uint8)]

@@ -1,11 +1,13 @@
 """Lines of decimal numbers as columns of whole numbers, at disk speed and in blocks.
 
-The format `text` has lines `t x y p`, as written by E2VID, ESIM and numpy; commas are accepted too.
+The format `text` has lines `t x y p`, as written by E2VID, ESIM, v2e and numpy, or `x,y,p,t`, as written by Prophesee's
+tools. Lines that begin with # or % are comments.
 """
 
+import itertools
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, no_type_check
 
@@ -13,72 +15,133 @@ import numba
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    Choices,
+    RecordingError,
+    Source,
+    byte_blocks,
+    sensor_size,
+    start_of,
+    unpacked,
+)
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
 BLOCK_BYTES = 2**22
 MAX_LINE = 2**12  # bytes
 
 COLUMNS = ("t", "x", "y", "p")
+PROPHESEE = ("x", "y", "p", "t")
 NAMES = {"time": "t", "timestamp": "t", "ts": "t", "pol": "p", "polarity": "p", "on": "p"}
 MICROSECONDS = 6  # decimals of a second
+TELLING_TIMES = 4  # different times that tell seconds from microseconds
+MAX_SEARCHED = 2**20  # lines searched for them: a simulated camera's first events may all be at time 0
 
-_SEPARATORS = re.compile(rb"[,;]")
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_SEPARATORS, _COMMENT = re.compile(rb"[,;\s]+"), re.compile(rb"[#%]")
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|(?i:true|false)")
+_POLARITY = re.compile(r"[+-]?[01](\.0*)?(e[+-]?0+)?|(?i:true|false)")
+_GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\D(\d{1,5})")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
+_POWERS = 10 ** np.arange(_DIGITS + 1)
 _MAX_VALUE = 2**60
-_END, _COMMENT = 10, 35  # line feed, #
+_END, _COMMENTS = 10, (35, 37)  # line feed, # and %
+
+
+class _Layout(NamedTuple):
+    """Facts about a file of lines from its head."""
+
+    order: tuple[str, ...] | None
+    """Names of the columns; None if these are no lines of events."""
+    start: int
+    """Byte offset of the first line that can be an event."""
+    size: Sequence[str]
+    """Width and height, if stated."""
+    columns: int
 
 
 def matches_text(path: Path, head: bytes) -> bool:
-    """Whether the first line names the columns, is `width height`, or is four numbers, the last mostly a polarity."""
-    if _names(head)[1]:
-        return True
-    lines = numbers_of(head)
-    if not lines:
-        return not head.strip()
-    words = lines[0].words
-    polarities = sum(float(line.words[-1]) in (-1, 0, 1) for line in lines)
-    return len(words) == 2 or (len(words) == len(COLUMNS) and 2 * polarities > len(lines))
+    """Whether the first lines name the columns or say `width height`, or are four numbers with a polarity."""
+    return _layout_of(head).order is not None
 
 
 def open_text(path: Path, choices: Choices) -> Source:
-    """Open lines `t x y p`, after a line `width height` or with the given size; # starts a comment.
+    """Open lines of events, after a line `width height` or with the given size; # and % start a comment.
 
-    A first line of names may give another order of the columns. t is in seconds where the first event's t has a decimal
-    point, else in microseconds; p is 1 or 0, or 1 or -1.
+    The order is that of a line of names. Without one it is t x y p, or x y p t if only the third column is a polarity.
+    t is in seconds if one of the first four different times has a fraction, else in microseconds. p is 1 or 0, 1 or
+    -1, or True or False.
     """
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    lines = numbers_of(head)
-    height = width = None
-    order, start = _names(head)
-    if lines and len(lines[0].words) == 2:
-        (size, start), *lines = lines
-        if not all(word.isdigit() for word in size):
-            raise RecordingError(f"{path.name}: expected a first line `width height`, got {' '.join(size)!r}")
-        width, height = map(int, size)
-    height, width = sensor_size(path, choices, height, width)
-    columns = len(lines[0].words) if lines else len(COLUMNS)
+    order, start, size, columns = _layout_of(start_of(path, HEAD_BYTES))
     if columns != len(COLUMNS):
         raise RecordingError(f"{path.name}: expected lines of the four columns t x y p, got {columns} columns")
-    place = order.index("t")
-    seconds = bool(lines) and "." in lines[0].words[place]
-    decimals = tuple(MICROSECONDS if seconds and name == "t" else 0 for name in order)
+    if not all(word.isdigit() for word in size):
+        raise RecordingError(f"{path.name}: expected a first line `width height`, got {' '.join(size)!r}")
+    width, height = map(int, size) if size else (None, None)
+    height, width = sensor_size(path, choices, height, width)
+    order = order or COLUMNS
+    decimals = [0] * len(order)
+    decimals[order.index("t")] = MICROSECONDS if _in_seconds(path, start, order.index("t")) else 0
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for rows in number_blocks(path, decimals, start, counts):
+        for rows in number_blocks(path, tuple(decimals), start, counts):
             yield Block(*(np.ascontiguousarray(rows[:, order.index(name)]) for name in COLUMNS))
 
     return Source(height, width, blocks)
 
 
-def _names(head: bytes) -> tuple[tuple[str, ...], int]:
-    """Column order from the names in the first line, and the next line's offset; t x y p if there are no names."""
-    line = head.split(b"\n", 1)[0]
-    words = re.split(r"[,;\s]+", line.decode("ascii", "replace").lower().strip(" #\r\t\ufeff"))
-    order = tuple(NAMES.get(word, word) for word in words)
-    return (order, len(line) + 1) if sorted(order) == sorted(COLUMNS) else (COLUMNS, 0)
+def _layout_of(head: bytes) -> _Layout:
+    geometry = _GEOMETRY.search(head)
+    size: Sequence[str] = [side.decode() for side in geometry.groups()] if geometry else []
+    order, start = _names(head)
+    lines = numbers_of(head[start:])
+    if lines and len(lines[0].words) == 2:
+        (size, end), *lines = lines
+        start += end
+    if order is None:
+        order = _order_of([line.words for line in lines])
+    if order is None and (size or not head.strip()):
+        order = COLUMNS
+    return _Layout(order, start, size, len(lines[0].words) if lines else len(COLUMNS))
+
+
+def _names(head: bytes) -> tuple[tuple[str, ...] | None, int]:
+    """Column order from a line of names before the numbers, and the next line's offset; None and 0 without one."""
+    place = 0
+    for line in head.splitlines(keepends=True):
+        place += len(line)
+        words = words_of(line.lower().strip(b" #%\r\n\t\xef\xbb\xbf"))
+        order = tuple(NAMES.get(word, word) for word in (one.decode("ascii", "replace") for one in words))
+        if sorted(order) == sorted(COLUMNS):
+            return order, place
+        if words and line.lstrip()[:1] not in (b"#", b"%"):
+            break
+    return None, 0
+
+
+def _order_of(lines: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
+    """The order whose column of polarities holds mostly polarities."""
+    fours = [words for words in lines if len(words) == len(COLUMNS)]
+    for order in (COLUMNS, PROPHESEE):
+        place = order.index("p")
+        if 2 * sum(bool(_POLARITY.fullmatch(words[place])) for words in fours) > len(lines):
+            return order
+    return None
+
+
+def _in_seconds(path: Path, start: int, place: int) -> bool:
+    """Whether times are in seconds: one of the first different ones has a fraction, or all are whole with a point."""
+    times: dict[float, bytes] = {}
+    with unpacked(path) as file:
+        file.seek(start)
+        for line in itertools.islice(iter(lambda: file.readline(MAX_LINE), b""), MAX_SEARCHED):
+            word = words[place] if len(words := words_of(line)) == len(COLUMNS) else b""
+            if word.isalpha() or not _NUMBER.fullmatch(word) or not abs(float(word)) < _MAX_VALUE:
+                continue
+            times.setdefault(float(word), word)
+            if not float(word).is_integer() or len(times) == TELLING_TIMES:
+                return not float(word).is_integer()
+    return any(b"." in word and b"e" not in word.lower() for word in times.values())
 
 
 def number_blocks(
@@ -87,23 +150,22 @@ def number_blocks(
     """Read the lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
 
     Column i is multiplied by 10**decimals[i]. Where decimals[i] > 0 the rest is rounded; elsewhere a fraction makes the
-    line unreadable. Numbers are separated by blanks, commas or semicolons; # starts a comment. Unreadable lines are
-    left out and counted as `unreadable_lines`, but one at the end without a line feed as `cut_tail`.
+    line unreadable. True is 1 and False 0. Numbers are separated by blanks, commas or semicolons; # and % start a
+    comment. Unreadable lines are left out and counted as `unreadable_lines`, but one at the end without a line feed as
+    `cut_tail`.
     """
     shift = np.array(decimals, np.int64)
-    with path.open("rb") as file:
-        file.seek(skip_bytes)
-        rest = b""
-        while data := file.read(BLOCK_BYTES):
-            data = rest + data
-            end = data.rfind(b"\n") + 1
-            rest = data[end:]
-            if len(rest) > MAX_LINE:
-                raise RecordingError(
-                    f"{path.name}: expected lines of numbers, got {len(rest)} bytes without the end of a line"
-                )
-            yield from rows_of(data[:end], shift, counts, "unreadable_lines")
-        yield from rows_of(rest, shift, counts, "cut_tail")
+    rest = b""
+    for block in byte_blocks(path, skip_bytes, BLOCK_BYTES, counts):
+        data = rest + block
+        end = data.rfind(b"\n") + 1
+        rest = data[end:]
+        if len(rest) > MAX_LINE:
+            raise RecordingError(
+                f"{path.name}: expected lines of numbers, got {len(rest)} bytes without the end of a line"
+            )
+        yield from rows_of(data[:end], shift, counts, "unreadable_lines")
+    yield from rows_of(rest, shift, counts, "cut_tail")
 
 
 class Line(NamedTuple):
@@ -122,12 +184,17 @@ def numbers_of(head: bytes) -> list[Line]:
         place += len(line)
         if len(line) == len(head) > MAX_LINE // 2 or (place == len(head) and numbers and not line.endswith(b"\n")):
             break  # cut off at the end of the head
-        words = _SEPARATORS.sub(b" ", line.split(b"#")[0]).split()
+        words = words_of(line)
         if words and all(map(_NUMBER.fullmatch, words)):
             numbers.append(Line([word.decode() for word in words], place))
         elif words:
             others += 1
     return numbers if len(numbers) >= others else []
+
+
+def words_of(line: bytes) -> list[bytes]:
+    """The words between blanks, commas and semicolons, before a comment."""
+    return [word for word in _SEPARATORS.split(_COMMENT.split(line, 1)[0]) if word]
 
 
 def rows_of(
@@ -137,7 +204,7 @@ def rows_of(
     buffer = np.frombuffer(data, np.uint8)
     start = 0
     while start < len(buffer):
-        rows = np.empty((BLOCK_EVENTS, len(shift)), np.int64)
+        rows = np.empty((len(shift), BLOCK_EVENTS), np.int64).T  # so that each column is contiguous
         filled, start, unreadable = _parse(buffer, start, shift, rows)
         counts[damage] += unreadable
         if filled:
@@ -160,7 +227,7 @@ def _parse(buffer, start, shift, rows):
         column, good = 0, True
         while place < size and buffer[place] != _END:
             code = buffer[place]
-            if code == _COMMENT:
+            if code in _COMMENTS:
                 while place < size and buffer[place] != _END:
                     place += 1
             elif _ends(code):
@@ -184,33 +251,31 @@ def _parse(buffer, start, shift, rows):
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
+    letter = buffer[place] | 32
+    if letter == 116 or letter == 102:  # True or False
+        while place < size and not _ends(buffer[place]):
+            place += 1
+        return np.int64(letter == 116), place, shift == 0 and place - start == (4 if letter == 116 else 5)
     negative = buffer[place] == 45
-    place += negative
-    value, first = 0, place
-    while place < size and 48 <= buffer[place] <= 57 and place - first < _DIGITS:
-        value = 10 * value + (buffer[place] - 48)
-        place += 1
-    if shift == 0 and place > first and (place == size or _ends(buffer[place])):
-        return -value if negative else value, place, True
-    place = start + (negative or buffer[start] == 43)
+    place += negative or buffer[place] == 43
     value, digits, count, exponent, point = 0, 0, 0, shift, False
     while place < size:
-        code = buffer[place]
-        if 48 <= code <= 57:
+        digit = np.int64(buffer[place]) - 48
+        if 0 <= digit <= 9:
             count += 1
             if digits < _DIGITS:
-                value = 10 * value + (code - 48)
+                value = 10 * value + digit
                 digits += value > 0
                 exponent -= point
             else:
                 exponent += not point
-        elif code == 46 and not point:
+        elif digit == -2 and not point:
             point = True
         else:
             break
         place += 1
     good = count > 0
-    if place < size and (buffer[place] == 101 or buffer[place] == 69):
+    if place < size and buffer[place] | 32 == 101:  # an exponent
         place += 1
         sign = -1 if place < size and buffer[place] == 45 else 1
         place += place < size and (buffer[place] == 45 or buffer[place] == 43)
@@ -220,18 +285,15 @@ def _number(buffer, place, shift):
             place += 1
         good = good and place > first
         exponent += sign * power
-    while exponent > 0 and value != 0 and good:
-        good = value < _MAX_VALUE // 10
-        value, exponent = 10 * value, exponent - 1
-    tenths = 0
-    while exponent < 0 and value != 0:
-        good = good and (shift > 0 or value % 10 == 0)
-        tenths = value % 10
-        value, exponent = value // 10, exponent + 1
-    value += tenths >= 5
-    good = good and value < _MAX_VALUE
+    if exponent > 0 and value:
+        good = good and exponent <= _DIGITS and value < _MAX_VALUE // _POWERS[min(exponent, _DIGITS)]
+        value *= _POWERS[min(exponent, _DIGITS)]
+    elif exponent < 0 and value:
+        unit = _POWERS[min(-exponent, _DIGITS)] if exponent >= -_DIGITS else _MAX_VALUE * 4
+        good = good and (shift > 0 or value % unit == 0)
+        value = value // unit + (value % unit >= unit - unit // 2)
+    good = good and (place == size or _ends(buffer[place]))
     while place < size and not _ends(buffer[place]):
-        good = False
         place += 1
     return -value if negative else value, place, good
 
@@ -239,4 +301,4 @@ def _number(buffer, place, shift):
 @numba.njit(nogil=True, cache=True, inline="always")
 @no_type_check
 def _ends(code):
-    return code in (32, 44, 59, 9, 13, _END, _COMMENT)
+    return code in (32, 44, 59, 9, 13, 10, 35, 37)

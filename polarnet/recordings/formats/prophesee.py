@@ -2,11 +2,14 @@
 
 EVT sends the high bits of the time occasionally, and the low bits in between. A sensor's clock sometimes steps back by
 some microseconds within the same high bits; its events keep their earlier times. DAT has 8 bytes per event.
+
+EVT2.1 exists in two byte orders: `little`, and `legacy` of the cameras up to the IMX647, whose 32-bit halves are
+exchanged. As in Prophesee's OpenEB, the header states the order, and where it does not, the camera's system ID does.
 """
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import no_type_check
 
@@ -28,10 +31,15 @@ from polarnet.recordings.source import (
 PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
 EVT_BLOCK_WORDS = 2**17
-MAX_PER_WORD = {"2": 1, "2.1": 32, "3": 12}  # events by version
-SENSORS = {b"gen31": (480, 640), b"gen3": (480, 640), b"gen4": (720, 1280), b"imx636": (720, 1280),
-           b"genx320": (320, 320)}  # fmt: skip
-"""Height and width by the sensor's name in the header of EVT; files of 2020 state nothing else."""
+SENSORS = {(480, 640): (b"gen3", b"3"), (720, 1280): (b"gen4|imx6", b"4"), (320, 320): (b"genx320", b"none")}
+"""Sensors' names and generation by height and width, in headers of EVT; files of 2020 state nothing else."""
+SYSTEMS = {
+    (480, 640): (21, 23, 25, 28, 29, 33, 34, 35, 40, 41),
+    (720, 1280): (26, 30, 31, 32, 39, 46, 48, 49, 50, 52, 53, 54, 58, 66),
+    (320, 320): (59, 64),
+}
+"""System IDs of cameras by height and width, as in OpenEB."""
+FIRST_LITTLE_ENDIAN = 55  # system ID of the EVK2 that came after those with exchanged halves
 DAT_EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 CHANGE_DETECTION = (0, 12)  # DAT's types of events: 2D of the first sensors, CD of the later ones
 
@@ -51,22 +59,36 @@ def open_evt(path: Path, choices: Choices) -> Source:
     header, _, _ = header_lines(path, PREFIX, LAST_LINE, MAX_HEADER_BYTES)
     stated = re.search(rb"% (?:evt |format EVT)(\d)\.?(\d)?", header)
     version = b".".join(filter(None, stated.groups())).decode().removesuffix(".0") if stated else "none"
-    if version not in MAX_PER_WORD:
+    if version not in EVT:
         raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2, 2.1 or 3, got {version}")
-    if b"endianness=legacy" in header:
-        raise RecordingError(f"{path.name}: expected EVT 2.1 of little endian, got endianness=legacy; record it again")
     height, width = sensor_size(path, choices, *_evt_size(header))
-    word, decode = {"2": ("<u4", _decode_evt2), "2.1": ("<u8", _decode_evt21), "3": ("<u2", _decode_evt3)}[version]
+    legacy = version == "2.1" and _is_legacy(header)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
-        state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
-        for words in word_blocks(path, len(header), word, EVT_BLOCK_WORDS, counts):
-            columns = [np.empty(MAX_PER_WORD[version] * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
-            events, orphans = decode(words, state, *columns)
-            counts["orphans"] += int(orphans)
-            yield Block(*(column[:events] for column in columns))
+        decode = evt_decoder(version, legacy)
+        for words in word_blocks(path, len(header), EVT[version][0], EVT_BLOCK_WORDS, counts):
+            yield decode(words, counts)
 
     return Source(height, width, blocks)
+
+
+def evt_decoder(version: str, legacy: bool = False) -> Callable[[np.ndarray, Counter[str]], Block]:
+    """A decoder of consecutive words of an EVT version; it counts events before the first time or row as `orphans`.
+
+    `legacy`: the two halves of the words of EVT2.1 are exchanged.
+    """
+    _, per_word, decode_words = EVT[version]
+    state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
+
+    def decode(words: np.ndarray, counts: Counter[str]) -> Block:
+        if legacy:
+            words = words << np.uint64(32) | words >> np.uint64(32)
+        columns = [np.empty(per_word * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
+        events, orphans = decode_words(words, state, *columns)
+        counts["orphans"] += int(orphans)
+        return Block(*(column[:events] for column in columns))
+
+    return decode
 
 
 def open_dat(path: Path, choices: Choices) -> Source:
@@ -103,10 +125,25 @@ def _evt_size(header: bytes) -> tuple[int | None, int | None]:
     height, width = (re.search(name + rb"=(\d{1,5})", header) for name in (b"height", b"width"))
     if height and width:
         return int(height[1]), int(width[1])
-    for name, size in SENSORS.items():
-        if re.search(rb"(?i)% (plugin_name|sensor_name|generation)[^\n]*" + name, header):
+    for size, (names, generation) in SENSORS.items():
+        named = rb"(?:plugin|sensor)_name [^\n]*(?:" + names + rb")|sensor_generation " + generation
+        if re.search(rb"(?i)% (?:" + named + rb")", header):
             return size
-    return None, None
+    system = _system_id(header)
+    return next((size for size, systems in SYSTEMS.items() if system in systems), (None, None))
+
+
+def _is_legacy(header: bytes) -> bool:
+    if stated := re.search(rb"endianness[= ](\w+)", header):
+        return stated[1] == b"legacy"
+    others = re.search(rb"integrator_name (?!Prophesee)", header)
+    return others is None and 0 < _system_id(header) < FIRST_LITTLE_ENDIAN
+
+
+def _system_id(header: bytes) -> int:
+    """The camera's system ID; 0 without one."""
+    stated = re.search(rb"% system_ID (\d{1,9})\s", header)
+    return int(stated[1]) if stated else 0
 
 
 def _decode_evt2(words: np.ndarray, *state_and_columns: np.ndarray) -> tuple[int, int]:
@@ -176,3 +213,7 @@ def _decode_evt3(words, state, t, x, y, p):
             base = min(base + pixels, 2048)  # outside every sensor; larger values would not fit into int16
     state[:] = high, turns, low, row, base, polarity
     return n, orphans
+
+
+EVT = {"2": ("<u4", 1, _decode_evt2), "2.1": ("<u8", 32, _decode_evt21), "3": ("<u2", 12, _decode_evt3)}
+"""Word, most events in a word, and decoder of each version."""

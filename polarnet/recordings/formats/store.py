@@ -4,16 +4,16 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, sensor_size
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, chosen_part, sensor_size
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 
-ZIP = b"PK\x03\x04"
+ANGLES = [str(angle) for angle in POLARIZER_ANGLES_DEG]
 
 
 def matches(path: Path, head: bytes) -> bool:
-    """Whether it is a folder with Zarr metadata, or a zip."""
-    return (path / "zarr.json").exists() if path.is_dir() else head.startswith(ZIP)
+    """Whether it is a folder with Zarr metadata."""
+    return (path / "zarr.json").exists()
 
 
 def open_store(path: Path, choices: Choices) -> Source:
@@ -22,17 +22,12 @@ def open_store(path: Path, choices: Choices) -> Source:
         store = EventStore.open(path)
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path.name}: {error}") from error
-    sequence, _, angle = (choices.part or "").rpartition("/")
-    if not sequence and len(store.sequences) == 1:
-        sequence = store.sequences[0]
-    angles = [str(a) for a in POLARIZER_ANGLES_DEG]
-    if sequence not in store.sequences or angle not in angles:
-        names = ", ".join(store.sequences[:8]) + (", ..." if len(store.sequences) > 8 else "")
-        raise RecordingError(
-            f"{path.name}: say which part to read as SEQUENCE/ANGLE, with a sequence of {names} and an angle of "
-            f"{', '.join(angles)}; got {choices.part!r}"
-        )
-    channel = angles.index(angle)
+    part = choices.part
+    if part in ANGLES and len(store.sequences) == 1:
+        part = f"{store.sequences[0]}/{part}"
+    parts = [f"{sequence}/{angle}" for sequence in store.sequences for angle in ANGLES]
+    sequence, _, angle = chosen_part(path, part, parts, "channel").rpartition("/")
+    channel = ANGLES.index(angle)
     height, width = sensor_size(path, choices, store.height, store.width)
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:

@@ -81,8 +81,36 @@ def test_prophesees_table_has_records_of_x_y_p_t_and_its_geometry(tmp_path, read
         read(write(tmp_path / "f.hdf5", {"CD/events": rows}))
     with pytest.raises(RecordingError, match="expected records of x, y, p, t in CD/events, there is no t"):
         read(write(tmp_path / "g.hdf5", {"CD/events": rows[["x", "y", "p"]]}))
-    with pytest.raises(RecordingError, match="expected HDF5 in the layout of Prophesee, there is no CD/events"):
+    with pytest.raises(RecordingError, match="expected HDF5 of Prophesee: there is no CD/events"):
         read(write_dsec(tmp_path / "h.h5"), "metavision")
+
+
+@pytest.mark.parametrize("geometry", [b"640x480", np.bytes_("640x480"), np.array(["640x480"], "S7")])
+def test_a_geometry_of_fixed_length_is_read(tmp_path, read, geometry):
+    rows = np.array([(639, 0, 1, 5)], PROPHESEE)
+    assert read(write(tmp_path / "e.hdf5", {"CD/events": rows}, geometry=geometry))[0] == ("metavision", 480, 640)
+
+
+@pytest.mark.parametrize(("ts", "t"), [([0.0, 0.001164], [0, 1164]), ([5.0, 9.0], [5, 9]), ([5, 9], [5, 9])])
+@pytest.mark.parametrize("size", [(480, 640), (640, 480)])
+def test_monash_has_seconds_or_microseconds_and_its_size_in_either_order(tmp_path, read, ts, t, size):
+    columns = {"xs": [639, 0], "ys": [0, 479], "ts": ts, "ps": [True, False]}
+    path = write(tmp_path / "e.h5", {f"events/{name}": v for name, v in columns.items()}, sensor_resolution=size)
+    assert read(path) == (("monash", 480, 640), [t, [639, 0], [0, 479], [1, -1]], {})
+
+
+def test_a_file_of_two_cameras_needs_the_camera(tmp_path, read):
+    columns = {"x": [1279, 0], "y": [0, 719], "t": [5, 9], "p": [1, 0]}
+    left = {f"prophesee/left/{name}": values for name, values in columns.items()}
+    left["prophesee/left/calib/resolution"] = [1280, 720]
+    path = write(tmp_path / "one.h5", left)
+    assert read(path) == (("m3ed", 720, 1280), [[5, 9], [1279, 0], [0, 719], [1, -1]], {})
+    table = np.array([[345, 0, 1.5, 1], [0, 259, 1.500004, -1]])
+    path = write(tmp_path / "two.h5", {"davis/left/events": table, "davis/right/events": table[:1]})
+    with pytest.raises(RecordingError, match=r"two\.h5: say which camera to read, --part with one of left, right"):
+        read(path, height=260, width=346)
+    form, columns, _ = read(path, height=260, width=346, part="left")
+    assert (form, columns) == (("mvsec", 260, 346), [[1_500_000, 1_500_004], [345, 0], [0, 259], [1, -1]])
 
 
 def test_prophesees_own_compression_names_the_plugin_that_it_needs(tmp_path, read):
@@ -122,7 +150,7 @@ def test_e2p_of_another_shape_is_refused(tmp_path, read):
         read(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
     with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
         read(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))
-    with pytest.raises(RecordingError, match="in the layout of E2P, there is no events"):
+    with pytest.raises(RecordingError, match=r"expected HDF5 of E2P, .*: there is no events"):
         read(write_dsec(tmp_path / "c.h5"), "e2p")
 
 

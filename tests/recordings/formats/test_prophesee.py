@@ -38,13 +38,31 @@ def test_evt3_words_worked_out_by_hand(read_words):
     assert repairs == {}
 
 
-@pytest.mark.parametrize("header", [b"% evt 2.1\n% geometry 640x480\n", b"% format EVT21;height=480;width=640\n"])
-def test_evt21_has_32_pixels_in_a_word_of_64_bits(tmp_path, read, header):
+GEOMETRY = b"% evt 2.1\n% geometry 640x480\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "legacy"),
+    [
+        (GEOMETRY, False),
+        (b"% format EVT21;height=480;width=640\n", False),
+        (b"% format EVT21;endianness=little;height=480;width=640\n% system_ID 49\n% end\n", False),
+        (b"% camera_integrator_name Prophesee\n" + GEOMETRY + b"% system_ID 55\n% end\n", False),
+        (b"% camera_integrator_name Other\n" + GEOMETRY + b"% system_ID 49\n% end\n", False),
+        (b"% format EVT21;endianness=legacy;height=480;width=640\n% geometry 640x480\n% end\n", True),
+        (GEOMETRY + b"% endianness legacy\n% end\n", True),
+        (b"% integrator_name Prophesee\n" + GEOMETRY + b"% system_ID 49\n% end\n", True),
+    ],
+)
+def test_evt21_has_32_pixels_in_a_word_whose_halves_older_cameras_exchange(tmp_path, read, header, legacy):
     def word(kind, low6_us, x, y, valid):
         return kind << 60 | low6_us << 54 | x << 43 | y << 32 | valid
 
-    words = [word(1, 9, 0, 0, 1), 8 << 60 | 3 << 32, word(1, 5, 32, 7, 0b101), word(0, 63, 608, 479, 1 << 31)]
-    (tmp_path / "e.raw").write_bytes(header + b"% end\n" + np.array(words, "<u8").tobytes())
+    words = np.array(
+        [word(1, 5, 32, 7, 1), 8 << 60 | 3 << 32, word(1, 5, 32, 7, 0b101), word(0, 63, 608, 479, 1 << 31)], "<u8"
+    )
+    halves = words.view("<u4").reshape(-1, 2)
+    (tmp_path / "e.raw").write_bytes(header + (halves[:, ::-1] if legacy else halves).tobytes())
     form, columns, repairs = read(tmp_path / "e.raw")
     assert (form, repairs) == (("evt", 480, 640), {"orphans": 1})
     assert columns == [[3 * 64 + 5, 3 * 64 + 5, 3 * 64 + 63], [32, 34, 639], [7, 7, 479], [1, 1, -1]]
@@ -60,13 +78,49 @@ def test_events_before_the_first_time_and_row_are_left_out_and_counted(read_word
     assert read_words(2, [1 << 28, 8 << 28, 1 << 28])[1] == {"orphans": 1}
 
 
-def test_the_sensors_name_stands_for_its_size(tmp_path, read):
+@pytest.mark.parametrize(
+    ("line", "size"),
+    [
+        ("plugin_name hal_plugin_gen41_evk3", (720, 1280)),
+        ("sensor_name Gen3.1", (480, 640)),
+        ("sensor_name IMX646", (720, 1280)),
+        ("sensor_generation 4.2", (720, 1280)),
+        ("sensor_generation 3.1", (480, 640)),
+        ("sensor_name GenX320", (320, 320)),
+        ("system_ID 21", (480, 640)),
+        ("system_ID 64", (320, 320)),
+    ],
+)
+def test_the_sensors_name_generation_or_system_stands_for_its_size(tmp_path, read, line, size):
     words = np.array([0x8001, 0x0007, 0x2000], "<u2").tobytes()
-    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% plugin_name hal_plugin_gen41_evk3\n" + words)
-    assert read(tmp_path / "e.raw")[0] == ("evt", 720, 1280)
+    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% " + line.encode() + b"\n% end\n" + words)
+    assert read(tmp_path / "e.raw")[0] == ("evt", *size)
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n" + words)
     with pytest.raises(RecordingError, match="give height and width"):
         read(tmp_path / "e.raw")
+
+
+@pytest.mark.parametrize("wrong", [2**32 - 50_000_000, 2**31 + 9, 0])
+def test_one_corrupt_stamp_of_dat_moves_no_other_event(tmp_path, read, wrong):
+    t = np.arange(100, 5000, 10) + (2**32 - 200 if wrong == 0 else 0)  # with 0, the stamps wrap after 20 events
+    stamps = t % 2**32
+    stamps[250] = wrong if wrong else 2**31 + 5
+    rows = np.stack([stamps, np.full(len(t), 1 << 28)], axis=1).astype("<u4")
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + rows.tobytes())
+    _, (found, *_), repairs = read(tmp_path / "e.dat")
+    assert (found, repairs) == (np.delete(t, 250).tolist(), {"time_glitches": 1})
+
+
+def test_late_stamps_around_a_wrap_and_a_long_pause_keep_their_times(tmp_path, read):
+    around = [*range(2**32 - 140, 2**32 - 20, 10), 2**32 - 15, 2, 2**32 - 10, 5, *range(10, 200, 10)]
+    rows = np.stack([around, np.full(len(around), 1 << 28)], axis=1).astype("<u4")
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + rows.tobytes())
+    times = sorted(t if t > 2**31 else t + 2**32 for t in around)
+    assert read(tmp_path / "e.dat")[1:] == ([times, *read(tmp_path / "e.dat")[1][1:]], {"unsorted": 1})
+    paused = [*range(0, 200, 10), *range(2**31 + 2**30, 2**31 + 2**30 + 200, 10)]
+    rows = np.stack([paused, np.full(len(paused), 1 << 28)], axis=1).astype("<u4")
+    (tmp_path / "e.dat").write_bytes(DAT_HEADER + b"\x0c\x08" + rows.tobytes())
+    assert read(tmp_path / "e.dat")[1][0] == paused
 
 
 def test_dat_version_2_has_14_bits_for_each_coordinate_and_version_1_has_9_and_8(tmp_path, read):
@@ -83,7 +137,6 @@ def test_dat_version_2_has_14_bits_for_each_coordinate_and_version_1_has_9_and_8
     ("name", "content", "message"),
     [
         ("e.raw", b"% evt 4.0\n1234", r"states EVT 2, 2\.1 or 3, got 4"),
-        ("e.raw", b"% evt 2.1\n% format EVT21;endianness=legacy;height=480;width=640\n", "got endianness=legacy"),
         ("e.dat", DAT_HEADER, "the file ends within its header"),
         ("e.dat", DAT_HEADER + b"\x0e\x08", "expected events of type 0 or 12 and 8 bytes, .* got type 14"),
         ("e.dat", b"% Version 7\n\x0c\x08", "expected DAT of version 1 or 2, got 7"),

@@ -1,3 +1,6 @@
+import gzip
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -25,17 +28,60 @@ def test_text_that_polarnet_exports_reads_back_equal(tmp_path, make_random_event
         ("-0.25 1 2 1\n+.5 1 2 1\n", [-250_000, 500_000]),
         ("t,x,y,p\n5,1,2,1\n6;1;2;0\n", [5, 6]),
         ("# a comment\n\n  5\t1 2 1  # late\r\n6 1 2 -1\r\n", [5, 6]),
+        ("0 1 2 1\n0 1 2 1\n0.25 1 2 0\n", [0, 0, 250_000]),
+        ("1e-05 1 2 1\n3.0000000000000004e-05 1 2 0\n", [10, 30]),
+        ("#!events.txt\n# v2e\n1e-05 1 2 1\n2 1 2 0\n", [10, 2_000_000]),
+        ("0.000000 1 2 1\n" * 400 + "0.000001 1 2 1\n", [0] * 400 + [1]),
+        ("".join(f"{t:.18e} 1 2 1\n" for t in (16e14 + 5, 16e14 + 6)), [1_600_000_000_000_005, 1_600_000_000_000_006]),
+        ("".join(f"{t:.1f} 1 2 1\n" for t in (5, 5, 6, 7, 8)), [5, 5, 6, 7, 8]),
+        ("3.000000 1 2 1\n4.000000 1 2 1\n", [3_000_000, 4_000_000]),
+        ("5 1 2 True\n6 1 2 False\n", [5, 6]),
+        ("5 1 2 true\n6 1 2 0\n", [5, 6]),
     ],
 )  # fmt: skip
-def test_times_are_seconds_with_a_point_and_microseconds_without(tmp_path, read, text, t):
+def test_times_with_a_fraction_are_seconds_and_whole_ones_microseconds(tmp_path, read, text, t):
     (tmp_path / "e.txt").write_text(text, newline="")
-    assert read(tmp_path / "e.txt", height=12, width=18)[1][:3] == [t, [1, 1], [2, 2]]
+    _, (times, x, y, p), _ = read(tmp_path / "e.txt", height=12, width=18)
+    assert (times, set(x), set(y), p[0]) == (t, {1}, {2}, 1)
 
 
 @pytest.mark.parametrize("names", ["x,y,p,t", "# x y polarity timestamp", "X;Y;on;time\r"])
 def test_a_first_line_of_names_tells_the_order(tmp_path, read, names):
     (tmp_path / "e.txt").write_text(f"{names}\n1,2,1,0.000005\n3,4,0,0.000006\n")
     assert read(tmp_path / "e.txt", height=12, width=18)[1:] == ([[5, 6], [1, 3], [2, 4], [1, -1]], {})
+
+
+@pytest.mark.parametrize("first", ["", "%geometry:18,12\n", "# geometry 18x12\n", "x,y,p,t\n", "18 12\n"])
+def test_prophesees_csv_has_the_time_last(tmp_path, read, first):
+    (tmp_path / "e.csv").write_text(first + "".join(f"{k % 18},{k % 12},{k % 2},{100 + 7 * k}\n" for k in range(50)))
+    size = {"height": 12, "width": 18} if first in ("", "x,y,p,t\n") else {}
+    form, (t, x, y, p), repairs = read(tmp_path / "e.csv", **size)
+    assert (form, t[1], x[:3], y[:3], p[:3], repairs) == (("text", 12, 18), 107, [0, 1, 2], [0, 1, 2], [-1, 1, -1], {})
+
+
+def test_text_in_a_gzip_or_zip_archive_is_read_and_a_cut_gzip_up_to_the_cut(tmp_path, read):
+    content = "18 12\n" + "".join(f"{7 * k} {k % 18} {k * k % 12} 1\n" for k in range(3000))
+    (tmp_path / "plain.txt").write_text(content)
+    expected = read(tmp_path / "plain.txt")
+    packed = gzip.compress(content.encode())
+    (tmp_path / "e.txt.gz").write_bytes(packed)
+    with zipfile.ZipFile(tmp_path / "e.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("events.txt", content)
+    assert read(tmp_path / "e.txt.gz") == read(tmp_path / "e.zip") == expected
+    (tmp_path / "e.txt.gz").write_bytes(packed[: len(packed) // 2])
+    _, (t, *_), repairs = read(tmp_path / "e.txt.gz")
+    assert t == expected[1][0][: len(t)]
+    assert len(t) > 500
+    assert repairs["cut_tail"] >= 1
+    (tmp_path / "e.txt.gz").write_bytes(packed[:100] + b"\0" * 20 + packed[120:])
+    with pytest.raises(RecordingError, match=r"e\.txt\.gz: the archive cannot be unpacked"):
+        read(tmp_path / "e.txt.gz")
+    with zipfile.ZipFile(tmp_path / "e.zip", "a") as archive:
+        archive.writestr("more.txt", content)
+    with pytest.raises(
+        RecordingError, match=r"e\.zip: expected one recording in the zip archive, got 2 files; unpack it"
+    ):
+        read(tmp_path / "e.zip")
 
 
 def test_numbers_are_those_that_numpy_writes(tmp_path, read):

@@ -1,0 +1,77 @@
+"""Files of the reference cases: layouts that once failed, and controls. Their kinds have tests of their own beside."""
+
+import pytest
+
+from polarnet.recordings.recording import read_recording
+from polarnet.recordings.source import RecordingError
+
+VGA = {"height": 480, "width": 640}
+SYNTHETIC = (1164, 199_805, [91, 359, 90], [10, 454, 339], [-1, -1, 1])
+STEREO = (637, 199_911, [50, 326, 220], [5, 98, 52], [1, 1, -1])
+AEDAT4 = (1_600_000_000_000_637, 1_600_000_000_199_911, *STEREO[2:])
+CASES = {
+    "aedat31.aedat": ({}, ("aedat3", 128, 128), 400, (1164, 199_805, [18, 71, 18], [2, 90, 67], [-1, -1, 1])),
+    "aedat4_LZ4.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
+    "aedat4_NONE.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
+    "aedat4_ZSTD.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
+    "aedat4_stereo.aedat4": ({"part": "0"}, ("aedat4", 260, 346), 300, AEDAT4),
+    "comment_first.txt": ({}, ("text", 480, 640), 400, SYNTHETIC),
+    "dsec_blosc.h5": (
+        VGA,
+        ("dsec", 480, 640),
+        400,
+        (57_922_808_752, 57_923_007_393, [9, 35, 9], [1, 45, 33], [-1, -1, 1]),
+    ),
+    "e2vid_events.zip": ({}, ("text", 480, 640), 400, SYNTHETIC),
+    "e2vid_monash.h5": ({}, ("monash", 480, 640), 400, SYNTHETIC),
+    "evk4_evt21_legacy.raw": ({}, ("evt", 720, 1280), 400, SYNTHETIC),
+    "evt3_lucid_0x9999.raw": ({}, ("evt", 720, 1280), 2, (1, 1, [3, 5], [5, 5], [-1, 1])),
+    "first_time_1e-05.txt": ({}, ("text", 480, 640), 400, (10, 198_651, *SYNTHETIC[2:])),
+    "jaer_davis346_x.aedat": ({}, ("aedat2", 260, 346), 2, (100, 200, [10, 10], [20, 20], [1, -1])),
+    "long_72min.txt": ({}, ("text", 48, 64), 60, (1, 5_900_500_000, [1, 1, 2], [1, 3, 3], [1, 1, -1])),
+    "metavision_file_to_csv.csv": (VGA, ("text", 480, 640), 400, SYNTHETIC),
+    "metavision_geometry.csv": ({}, ("text", 480, 640), 400, SYNTHETIC),
+    "metavision_vlen_geometry.hdf5": ({}, ("metavision", 480, 640), 400, SYNTHETIC),
+    "mono.bag": ({}, ("rosbag", 260, 346), 300, STEREO),
+    "openeb_111_incomplete_vect.raw": ({}, ("evt", 720, 1280), 3, (1, 1_044_480, [0, 10, 1], [0, 0, 0], [-1, -1, -1])),
+    "ros2_mono": ({}, ("rosbag", 260, 346), 300, STEREO),
+    "ros2_mono/ros2_mono.mcap": ({}, ("rosbag", 260, 346), 300, STEREO),
+    "savetxt_us.txt": (VGA, ("text", 480, 640), 60, (1164, 32_901, *SYNTHETIC[2:])),
+    "v2e.h5": (VGA, ("e2p", 480, 640), 400, SYNTHETIC),
+    "v2e_first_1e-05.txt": (VGA, ("text", 480, 640), 299, (10, 2990, [1, 2, 3], [1, 2, 3], [1, -1, 1])),
+}
+"""Arguments; format, height and width; events; times of the first and last event, and the first x, y and p."""
+REFUSED = {
+    "aedat4_stereo.aedat4": "--part with one of 0, 1",
+    "stereo.bag": "--part with one of /davis/left/events, /davis/right/events",
+    "v2e_47_polarity.h5": "events of a polarity that is neither brighter nor darker",
+}
+
+
+@pytest.fixture
+def cases(shared):
+    for package in ("faery", "h5py", "hdf5plugin", "rosbags"):
+        pytest.importorskip(package)
+    return shared / "cases" / "recordings"
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", CASES)
+def test_a_case_has_the_events_that_it_was_written_with(cases, read, name):
+    arguments, stated, count, expected = CASES[name]
+    form, (t, *columns), _ = read(cases / name, **arguments)
+    assert (form, len(t), (t[0], t[-1], *(column[:3] for column in columns))) == (stated, count, expected)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_case_that_cannot_be_read_as_it_is_says_why(cases, name):
+    with pytest.raises(RecordingError, match=REFUSED[name]):
+        read_recording(cases / name, **({} if name != "v2e_47_polarity.h5" else VGA))
+
+
+@pytest.mark.shared
+def test_the_cut_case_is_the_start_of_the_whole_one_and_the_packets_hold_no_event(cases, read):
+    (_, whole, _), (_, cut, repairs) = (read(cases / f"aedat4_{name}.aedat4") for name in ("full", "cut"))
+    assert (len(whole[0]), cut, repairs) == (600, [column[:360] for column in whole], {"cut_tail": 1})
+    assert read(cases / "ros2_event_packet") == (("rosbag", 720, 1280), [[]] * 4, {})
