@@ -32,17 +32,19 @@ def test_files_that_faery_writes_are_read(tmp_path, read, name, options, form):
 
 
 def write_streams(path, **streams):
-    """AEDAT4 with a packet every 10 ms of each stream of events: its sensor's width and height, and its rows."""
+    """AEDAT4 with a packet of 60 events for each stream of events: its sensor's width and height, and its rows."""
     dv = pytest.importorskip("dv_processing", reason="the extra live is not installed")
     config = dv.io.MonoCameraWriter.Config("DAVIS346")
     for name, (size, _) in streams.items():
         config.addEventStream(size, name)
     writer = dv.io.MonoCameraWriter(str(path), config)
+    writer.setPackagingCount(60)
     for name, (_, rows) in streams.items():
-        store = dv.EventStore()
-        for t, x, y, p in rows:
-            store.push_back(t, x, y, p)
-        writer.writeEvents(store, name)
+        for start in range(0, len(rows), 60):
+            store = dv.EventStore()
+            for row in rows[start : start + 60]:
+                store.push_back(*row)
+            writer.writeEvents(store, name)
     return path
 
 
