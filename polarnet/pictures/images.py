@@ -18,6 +18,7 @@ from torch import Tensor
 from polarnet.runtime.files import sha256
 
 MAX_PIXELS = 2**28  # limit for one picture, which takes 3 GiB as float32 RGB
+LEAST_WHITE = 2.0**-16  # largest value of a float picture: below it, 16 bits hold nothing but black
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
@@ -254,6 +255,11 @@ def _plain(pixels: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
         return (pixels / np.iinfo(pixels.dtype).max).astype(np.float32)
     if not np.isfinite(pixels).all():
         raise UnreadablePicture(f"{np.count_nonzero(~np.isfinite(pixels))} values are not finite numbers")
+    middle, largest = float(np.median(pixels.astype(np.float64))), float(pixels.max())
+    if not 0 <= middle <= 1 or 0 < largest < LEAST_WHITE:
+        raise UnreadablePicture(
+            f"expected floats with 1.0 as white, got a median of {middle:g} and at most {largest:g}; scale the picture"
+        )
     return pixels.astype(np.float32)
 
 

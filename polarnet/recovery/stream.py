@@ -114,6 +114,10 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
     Windows that are already available, such as those of a file, are processed in runs of up to `at_once` windows
     (default: `Recoverer.at_once`). ValueError if the input is shorter than one window.
     """
+    if min(source.height, source.width) < 2:  # the network's means over neighbours would have none
+        raise ValueError(
+            f"expected a sensor of at least 2x2 pixels behind each polarizer, got {source.height}x{source.width}"
+        )
     warm_up(recoverer, source.height, source.width, source.channels)
     cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)

@@ -11,7 +11,7 @@ import hashlib
 import os
 import shutil
 import unicodedata
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -66,8 +66,9 @@ def replaced(path: Path) -> Iterator[Path]:
     """
     temporary = path.with_name(f"{path.name}.tmp")
     try:
-        yield temporary
-        _to_disk(temporary)
+        with named_shortage(path):
+            yield temporary
+            _to_disk(temporary)
         temporary.replace(path)
         _to_disk(path.parent)
     finally:
@@ -186,10 +187,10 @@ def check_seal(folder: Path, names: Collection[str] | None = None) -> None:
 
 
 @contextmanager
-def claimed(path: Path, say_waiting: Callable[[], None] | None = None) -> Iterator[None]:
+def claimed(path: Path) -> Iterator[None]:
     """Lock `path`, by PATH.lock.tmp, so that only this process may write it, until the block or the process ends.
 
-    If another process has it: ValueError, or with `say_waiting` a call of it and a wait until the other one ends.
+    ValueError if another process has it; OSError with the name of `path` where a disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = path.with_name(f"{path.name}.lock.tmp")
@@ -197,12 +198,9 @@ def claimed(path: Path, say_waiting: Callable[[], None] | None = None) -> Iterat
     try:
         lock.acquire()
     except Timeout:
-        if say_waiting is None:
-            raise ValueError(
-                f"{path}: another process is writing it; wait until that has ended, or write to another path"
-            ) from None
-        say_waiting()
-        lock.acquire(timeout=-1)
+        raise ValueError(
+            f"{path}: another process is writing it; wait until that has ended, or write to another path"
+        ) from None
     try:
         if not path.exists():
             with contextlib.suppress(FileNotFoundError):

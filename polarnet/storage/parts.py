@@ -31,7 +31,7 @@ import numpy as np
 import zarr
 from pydantic import PositiveInt
 
-from polarnet.runtime.files import check_name, check_room, claimed, code_digest, publish, sha256
+from polarnet.runtime.files import check_name, check_room, claimed, code_digest, named_shortage, publish, sha256
 from polarnet.runtime.sections import section
 from polarnet.storage.groups import REPAIR, GrowingColumns, is_url, open_group, raise_unreadable
 
@@ -178,12 +178,12 @@ class Store:
         expected = names[len(begun.records)] if begun else names[0]
         if begun is None or sequence != expected:
             raise ValueError(f"{self.path}: {part} takes its sequences in order, expected {expected}, got {sequence}")
-        begun.append(sequence, columns, record)
-        if sequence == names[-1]:
-            size = self._unfinished.pop(part).finish()
-            if not is_url(self.path):
-                missing = len(self.parts) - len(list(Path(self.path).glob("part-?????")))
-                check_room(Path(self.path), missing * size, f"the {missing} missing parts")
+        with named_shortage(Path(self.path)):
+            begun.append(sequence, columns, record)
+            size = self._unfinished.pop(part).finish() if sequence == names[-1] else 0
+        if size and not is_url(self.path):
+            missing = len(self.parts) - len(list(Path(self.path).glob("part-?????")))
+            check_room(Path(self.path), missing * size, f"the {missing} missing parts")
 
     def finish(self) -> None:
         """Mark the store complete and move it from PATH.tmp to PATH; ValueError where sequences are missing."""

@@ -106,6 +106,8 @@ def test_files_without_a_usable_picture_are_refused_with_the_reason(tmp_path, rg
     values = np.zeros((20, 30, 3), np.float32)
     values[0, 0, 0] = np.nan
     tifffile.imwrite(tmp_path / "nan.tif", values, photometric="rgb")
+    for level in (-1.0, 3e38, 1e-42):
+        tifffile.imwrite(tmp_path / f"{level}.tif", np.full((20, 30, 3), level, np.float32), photometric="rgb")
     content = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
     chunk = struct.pack(">I4s", 12, b"iCCP") + b"x\0\0not a zlib"[:12]
     profile = chunk + struct.pack(">I", zlib.crc32(chunk[4:]))
@@ -114,6 +116,8 @@ def test_files_without_a_usable_picture_are_refused_with_the_reason(tmp_path, rg
         ("text.png", "cannot be read: Not a PNG file"), ("empty.jpg", 'cannot be read: Empty file "empty.jpg"'),
         ("grey.tif", "one channel"), ("grey_alpha.png", "one channel"), ("a.dng", "camera raw"),
         ("nan.tif", "1 values are not finite numbers"), ("profile.png", "the embedded colour profile is damaged"),
+        ("-1.0.tif", "expected floats with 1.0 as white"), ("3e+38.tif", "expected floats with 1.0 as white"),
+        ("1e-42.tif", "expected floats with 1.0 as white"),
         ("missing.jpg", 'cannot be read: Could not open file "missing.jpg"'),
     ):  # fmt: skip
         assert reason(tmp_path / name).startswith(words)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import zarr
+from event_fixtures import random_events
 
 from polarnet.cli import main
 from polarnet.config.pipeline import setup_of
@@ -307,3 +308,14 @@ def test_the_shipped_network_takes_the_thresholds_of_the_camera_and_other_method
     recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
     assert words.endswith(str(shipped_weights()))
     assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 20), (20, 1)])
+def test_a_sensor_of_one_row_or_column_is_refused(height, width, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    store = EventStore.create("line.zarr", ["a"], height, width, {})
+    store.write("a", [random_events(seed, 2000, 400_000, height, width) for seed in range(4)], 400_000)
+    store.finish()
+    assert main(["recover", "line.zarr", "--write", "zarr"]) == 1
+    message = f"expected a sensor of at least 2x2 pixels behind each polarizer, got {height}x{width}"
+    assert message in capsys.readouterr().err
