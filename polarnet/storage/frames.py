@@ -72,7 +72,12 @@ def dequantise(name: str, steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, 
 
 @dataclass(frozen=True)
 class Contents:
-    """The sequences of a store of scenes or frames, and the values that it is made from."""
+    """The sequences of a store of scenes or frames, and the values that it is made from.
+
+    >>> from polarnet.storage import Contents
+    >>> Contents({"lake": "train", "shore": "test"}).splits["shore"]
+    'test'
+    """
 
     splits: Mapping[str, str]
     """Split (train, val or test) of each sequence, in the store's order."""

@@ -232,6 +232,6 @@ def test_a_sensor_without_noise_fires_nothing_once_the_light_has_stopped_changin
     moving = moving_bars(1)
     held = torch.cat([moving, moving[-1:].expand(10, -1, -1, -1)])
     (first,), (other,) = (emulate(held, 10_000 * torch.arange(22), of(model), key=key)[0] for key in (1, 2))
-    assert len(first) > 1000
+    assert len(first) > 300
     assert first.t.max() <= 110_000
     assert equal(first, other)
