@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import ConvGRU, Level, conv3x3, on_blocks
+from polarnet.networks.base.blocks import ConvGRU, Level, ResidualBlock, conv3x3, on_blocks
 
 
 def sigmoid(x: float) -> float:
@@ -58,3 +58,11 @@ def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
     torch.manual_seed(0)
     layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)
     torch.testing.assert_close(on_blocks(layer, image), layer(F.pixel_unshuffle(image, 2)))
+
+
+@torch.no_grad()
+def test_a_residual_block_with_zero_weights_is_a_relu():
+    block = ResidualBlock(2)
+    for parameter in block.parameters():
+        torch.nn.init.zeros_(parameter)
+    assert block(torch.tensor([-1.0, 2.0]).view(1, 2, 1, 1)).flatten().tolist() == [0.0, 2.0]

@@ -66,7 +66,7 @@ def test_options_without_a_meaning_are_refused(folder, capsys, words, message):
 
 
 def test_inspect_writes_the_list_of_hot_pixels_that_recover_reads(folder, capsys):
-    rows = [(10 * k, k * 5 % 18, k * 7 % 12, 1) if k % 2 else (10 * k, 3, 4, 1) for k in range(4000)]
+    rows = [(10 * k, k // 2 % 18, k // 36 % 12, 1) if k % 2 else (10 * k, 3, 4, 1) for k in range(4000)]
     (folder / "e.txt").write_text("18 12\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in rows))
     assert main(["inspect", "e.txt", "--out", "out"]) == 0
     assert "list        out/e.txt.hot.txt, for --hot-pixels" in capsys.readouterr().out
