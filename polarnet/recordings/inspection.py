@@ -2,7 +2,9 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Int64, UInt16
 
@@ -59,12 +61,12 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         t = events.t.numpy()
         first, last = int(t[0]), int(t[-1])
         start_us, stop_us, began = (start_us, stop_us, True) if began else (first, first, True)
-        np.add.at(counts.reshape(-1), (events.y.long() * reader.width + events.x).numpy(), 1)
-        on += int((events.p > 0).sum())
-        silences = np.diff(t, prepend=stop_us)
-        longest = int(silences.argmax())
-        if silences[longest] > gap_us:
-            gap_us, gap_start_us = int(silences[longest]), int(t[longest] - silences[longest])
+        brighter, silence_us, silence_end_us = _tally(
+            t, events.x.numpy(), events.y.numpy(), events.p.numpy(), counts, stop_us
+        )
+        on += brighter
+        if silence_us > gap_us:
+            gap_us, gap_start_us = silence_us, silence_end_us - silence_us
         stop_us = last
         # many pixels fire when a camera or its simulation starts, which is not the scene's motion
         duration = (first == start_us or len(t) < size, last - first)
@@ -91,6 +93,20 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         pictures,
         first_picture,
     )
+
+
+@numba.njit(nogil=True, cache=True)
+@no_type_check
+def _tally(t, x, y, p, counts, before):
+    """Count the events of each pixel; returns the number of ON events, the longest silence and its end."""
+    on, longest, end = 0, 0, before
+    for i in range(len(t)):
+        counts[y[i], x[i]] += 1
+        on += p[i] > 0
+        if t[i] - before > longest:
+            longest, end = t[i] - before, t[i]
+        before = t[i]
+    return on, longest, end
 
 
 def findings(inspection: Inspection) -> Iterator[str]:

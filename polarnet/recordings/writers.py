@@ -63,10 +63,9 @@ def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int 
 
 
 def _growing(file: Any, name: str, dtype: type[np.generic]) -> Any:
-    """An empty dataset that `_append` extends."""
-    return file.create_dataset(
-        name, (0,), dtype, maxshape=(None,), chunks=(HDF5_CHUNK,), compression="gzip", compression_opts=1, shuffle=True
-    )
+    """An empty dataset that `_append` extends; coordinates, which gzip hardly shrinks, are not compressed."""
+    packed = {} if name in ("events/x", "events/y") else {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    return file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(HDF5_CHUNK,), **packed)
 
 
 def _append(dataset: Any, values: np.ndarray) -> None:

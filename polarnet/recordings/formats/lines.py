@@ -45,7 +45,10 @@ _GEOMETRY = re.compile(rb"(?m)^[#%]\s*geometry\W+(\d{1,5})\D(\d{1,5})")
 _DIGITS = 18  # decimal digits that always fit into int64; further ones are less than a microsecond
 _POWERS = 10 ** np.arange(_DIGITS + 1)
 _MAX_VALUE = 2**60
-_END, _COMMENTS = 10, (35, 37)  # line feed, # and %
+_LIMITS = _MAX_VALUE // _POWERS  # of a number that is multiplied by that power
+_END, _SEPARATOR_CODE, _COMMENT_CODE = 10, 1, 2  # line feed; values of _KINDS
+_KINDS = np.zeros(256, np.uint8)  # of a byte: 0 for a part of a number
+_KINDS[list(b" ,;\t\r\n")], _KINDS[list(b"#%")] = _SEPARATOR_CODE, _COMMENT_CODE
 
 
 class _Layout(NamedTuple):
@@ -226,11 +229,11 @@ def _parse(buffer, start, shift, rows):
     while place < size and filled < len(rows):
         column, good = 0, True
         while place < size and buffer[place] != _END:
-            code = buffer[place]
-            if code in _COMMENTS:
+            kind = _KINDS[buffer[place]]
+            if kind == _COMMENT_CODE:
                 while place < size and buffer[place] != _END:
                     place += 1
-            elif _ends(code):
+            elif kind == _SEPARATOR_CODE:
                 place += 1
             else:
                 value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
@@ -251,9 +254,22 @@ def _parse(buffer, start, shift, rows):
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
+    value, end, most = 0, place, min(size, place + _DIGITS - 1)  # first the common case: digits, maybe with a point
+    while end < most and 48 <= buffer[end] <= 57:
+        value = 10 * value + buffer[end] - 48
+        end += 1
+    missing = shift
+    if start < end < most and shift > 0 and buffer[end] == 46:
+        end += 1
+        while end < most and missing > 0 and 48 <= buffer[end] <= 57:
+            value = 10 * value + buffer[end] - 48
+            end += 1
+            missing -= 1
+    if start < end < most and _KINDS[buffer[end]] and value < _LIMITS[missing]:
+        return value * _POWERS[missing], end, True
     letter = buffer[place] | 32
     if letter == 116 or letter == 102:  # True or False
-        while place < size and not _ends(buffer[place]):
+        while place < size and not _KINDS[buffer[place]]:
             place += 1
         return np.int64(letter == 116), place, shift == 0 and place - start == (4 if letter == 116 else 5)
     negative = buffer[place] == 45
@@ -286,19 +302,13 @@ def _number(buffer, place, shift):
         good = good and place > first
         exponent += sign * power
     if exponent > 0 and value:
-        good = good and exponent <= _DIGITS and value < _MAX_VALUE // _POWERS[min(exponent, _DIGITS)]
+        good = good and exponent <= _DIGITS and value < _LIMITS[min(exponent, _DIGITS)]
         value *= _POWERS[min(exponent, _DIGITS)]
     elif exponent < 0 and value:
         unit = _POWERS[min(-exponent, _DIGITS)] if exponent >= -_DIGITS else _MAX_VALUE * 4
         good = good and (shift > 0 or value % unit == 0)
         value = value // unit + (value % unit >= unit - unit // 2)
-    good = good and (place == size or _ends(buffer[place]))
-    while place < size and not _ends(buffer[place]):
+    good = good and (place == size or _KINDS[buffer[place]])
+    while place < size and not _KINDS[buffer[place]]:
         place += 1
     return -value if negative else value, place, good
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-@no_type_check
-def _ends(code):
-    return code in (32, 44, 59, 9, 13, 10, 35, 37)
