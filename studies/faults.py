@@ -1,4 +1,4 @@
-"""What damaged artefacts and killed writers do, and whether bytes are the same elsewhere: python -m studies.faults
+"""Damaged artefacts, killed writers and hostile names, and what polarnet does with each: python -m studies.faults
 
 - artefacts: copies of the artefacts of a finished run are damaged, one after another, by one of FAULTS. Used as the
   next stage would, an artefact must be refused with one line that names the file or the folder, or give the same values
@@ -274,7 +274,7 @@ WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]
     "folder of a command": (write_folder, read_folder),
     "store": (write_store, read_events),
 }
-"""What is killed while it replaces an old result with a new one, and what reads the values there."""
+"""Writers that are killed while they replace an old result with a new one, and readers of the values there."""
 NAMES = [
     "../outside",
     "../../../outside",

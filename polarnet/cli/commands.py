@@ -32,7 +32,8 @@ def command_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> float:
+def positive(text: str) -> float:
+    """An argument above 0; its name stands in argparse's message about another text."""
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a number above 0, got {text}")
@@ -133,7 +134,7 @@ def _stores(command: AddCommand) -> None:
     )
     replay.add_argument("store", help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
-    replay.add_argument("--speed", type=_positive, default=1.0, help="speed relative to the recording (default: 1)")
+    replay.add_argument("--speed", type=positive, default=1.0, help="speed relative to the recording (default: 1)")
 
 
 def _simulate(command: AddCommand) -> None:
@@ -158,7 +159,7 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     add("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     add("--to", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
-    add("--fps", type=_positive, metavar="HZ", help="frames a second (default: as a video states)")
+    add("--fps", type=positive, metavar="HZ", help="frames a second (default: as a video states)")
     add(
         "--times", type=Path, metavar="FILE", help="a line with the time of each frame (default: FOLDER/timestamps.txt)"
     )
@@ -243,7 +244,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     formats = ("zarr", "png", "mp4")
     add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr png mp4)")
-    add("--video-rate", type=_positive, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)")
+    add("--video-rate", type=positive, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)")
     _reading(recover)
 
 

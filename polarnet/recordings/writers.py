@@ -63,7 +63,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int 
 
 
 def _growing(file: Any, name: str, dtype: type[np.generic]) -> Any:
-    """An empty dataset that `_append` extends; coordinates, which gzip hardly shrinks, are not compressed."""
+    """An empty dataset that `_append` extends; coordinates are not compressed, for speed."""
     packed = {} if name in ("events/x", "events/y") else {"compression": "gzip", "compression_opts": 1, "shuffle": True}
     return file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(HDF5_CHUNK,), **packed)
 

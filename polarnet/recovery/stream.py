@@ -114,7 +114,7 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
     Windows that are already available, such as those of a file, are processed in runs of up to `at_once` windows
     (default: `Recoverer.at_once`). ValueError if the input is shorter than one window.
     """
-    if min(source.height, source.width) < 2:  # the network's means over neighbours would have none
+    if min(source.height, source.width) < 2:  # the shipped network's DoLP of one row is not finite
         raise ValueError(
             f"expected a sensor of at least 2x2 pixels behind each polarizer, got {source.height}x{source.width}"
         )
