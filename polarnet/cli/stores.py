@@ -30,7 +30,7 @@ from polarnet.training.engine.recorder import read_running
 
 STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
 FILES: dict[str, Callable[[Path], object]] = {".safetensors": load_checkpoint, ".pt": read_running}
-UNFINISHED = (".tmp", ".partial", ".old")
+UNFINISHED = (".tmp", ".partial")
 
 
 def inspect(options: argparse.Namespace) -> None:

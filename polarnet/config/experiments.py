@@ -11,7 +11,8 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.nodes import MappingNode, Node
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import Node
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
@@ -24,7 +25,7 @@ MAPPINGS = ("randomise",)
 GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
 CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
-BEYOND_VALUES = re.compile(r"\$\{|^\s*#\s*@package", re.MULTILINE)
+MAX_DEPTH = 20
 MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 
 
@@ -130,14 +131,21 @@ def _check_params(settings: type, file: Path) -> None:
     A key `hydra` could make Hydra write into any file, an interpolation could print a secret, a comment `@package`
     could move the file elsewhere, and a few aliases of aliases make billions of values.
     """
-    text = file.read_text(encoding="utf-8")
-    if found := BEYOND_VALUES.search(text):
-        raise ValueError(f"{file}: expected plain values without Hydra's {found[0].strip()!r}; remove it")
-    root = YAML(typ="safe", pure=True).compose(text)
-    if (values := _values_of(root)) > MAX_VALUES:
-        raise ValueError(f"{file}: expected at most {MAX_VALUES} values, its aliases make {values:g}")
-    for key, _ in root.value if isinstance(root, MappingNode) else []:
-        if refusal := unknown_key(settings, [str(key.value)]):
+    try:
+        text, yaml = file.read_text(encoding="utf-8"), YAML(typ="safe", pure=True)
+        root = yaml.compose(text)
+        if (values := _values_of(root)) > MAX_VALUES:
+            raise ValueError(f"expected at most {MAX_VALUES} values, {MAX_DEPTH} deep, its aliases make {values:g}")
+        content = yaml.load(text)
+        if not isinstance(content, dict):
+            raise ValueError("expected sections")
+    except (ValueError, YAMLError, RecursionError) as error:
+        raise ValueError(f"{file} is not a file of values: {' '.join(str(error).split())}") from None
+    for beyond in ("${", "@package"):
+        if beyond in f"{text}{content}":  # in the content, too, because YAML has escapes for any letter
+            raise ValueError(f"{file}: expected plain values without Hydra's {beyond!r}; remove it")
+    for key in content:
+        if refusal := unknown_key(settings, [str(key)]):
             raise ValueError(f"{file}: {refusal}")
 
 
@@ -145,12 +153,13 @@ def _values_of(root: Node | None) -> int | float:
     """Number of values below a node, with every alias written out: a few lines can make billions."""
     sizes: dict[int, int | float] = {}
 
-    def size(node: Node) -> int | float:
+    def size(node: Node, depth: int = 0) -> int | float:
         if id(node) not in sizes:
             sizes[id(node)] = math.inf  # for an alias of a node inside itself
             items = node.value if isinstance(node.value, list) else []
             parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
-            sizes[id(node)] = 1 + sum(map(size, parts))
+            if depth < MAX_DEPTH:
+                sizes[id(node)] = 1 + sum(size(part, depth + 1) for part in parts)
         return sizes[id(node)]
 
     return 0 if root is None else size(root)

@@ -26,7 +26,7 @@ from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
-from polarnet.runtime.sections import one_of, section
+from polarnet.runtime.sections import one_of, section, section_of
 from polarnet.simulation.camera import Camera, PolarizersConfig, ReadoutConfig, channel_size
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
@@ -57,30 +57,26 @@ if typing.TYPE_CHECKING:
     MethodsConfig = Any
     BaselinesConfig = Any
 else:
-
-    def _assembled(name: str, fields: Mapping[str, Any]) -> type:
-        return section(dataclasses.make_dataclass(name, fields.items(), frozen=True))
-
-    NetworksConfig = _assembled("NetworksConfig", NETWORKS)
+    NetworksConfig = section_of("NetworksConfig", NETWORKS)
     """Section `networks` of params.yaml: one section for each network; `network` names the network in use."""
-    MethodsConfig = _assembled(
+    MethodsConfig = section_of(
         "MethodsConfig",
         {m.name: m.config for m in METHODS.values() if m.config is not None}
         | {"sharpening": SharpeningConfig, "gain": GainConfig},
     )
     """Section `methods` of params.yaml: one section for each method with settings, and two that methods share."""
     _OF_LOOP = typing.get_type_hints(LoopConfig, include_extras=True)
-    SharedTrainingConfig = _assembled(
+    SharedTrainingConfig = section_of(
         "SharedTrainingConfig", {name: hint for name, hint in _OF_LOOP.items() if name not in OWN_KEYS}
     )
 
     def _own_section(config: type) -> type:
         hints = typing.get_type_hints(config, include_extras=True)
-        return _assembled(
+        return section_of(
             config.__name__, {name: hint for name, hint in hints.items() if name in OWN_KEYS or name not in _OF_LOOP}
         )
 
-    BaselinesConfig = _assembled(
+    BaselinesConfig = section_of(
         "BaselinesConfig",
         {"trained": list[BaselineName], "training": SharedTrainingConfig}
         | {name: _own_section(record.config) for name, record in BASELINES.items()},

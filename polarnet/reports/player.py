@@ -21,6 +21,7 @@ from markupsafe import Markup
 
 from polarnet.reports.legend import Legend, with_structure
 from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, paper_map, table_of
+from polarnet.runtime.files import replaced
 from polarnet.storage.panels import NO_EVENTS, Panel
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
@@ -117,7 +118,8 @@ def write_player(
     page = template("viewer.html.jinja").render(
         title=title, player_json=player, facts=facts, notes=notes, video=video, script=script
     )
-    path.write_text(page, encoding="utf-8")
+    with replaced(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
     return path
 
 

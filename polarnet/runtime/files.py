@@ -22,6 +22,7 @@ SUMS = "SHA256SUMS"
 ORIGIN = "origin.json"
 """File in a folder of the pipeline that says how it was made (`polarnet.config.origins`); it has its own checksum."""
 REMAKE = "run the stage that makes it again, or copy the folder again from where it is whole"
+UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")  # categories of Unicode: control, format, surrogate, line, paragraph
 MAX_NAME = 200  # bytes; file systems allow 255, and names get suffixes
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 AT_FDCWD = -100
@@ -49,52 +50,61 @@ def code_digest() -> str:
 
 
 def check_name(name: str) -> str:
-    """The name itself, of a sequence or another thing that a path is made of; ValueError if it could name a place."""
-    strange = any(letter in "/\\" or unicodedata.category(letter) == "Cc" for letter in name)
+    """The name itself, of a sequence or another thing that a path is made of; ValueError if it could name a place.
+
+    ValueError, too, for letters that no one sees, that turn a line around, or that no file's name can hold.
+    """
+    strange = any(letter in "/\\" or unicodedata.category(letter) in UNSEEN for letter in name)
     if strange or name in ("", ".", "..") or len(name.encode(errors="replace")) > MAX_NAME:
         raise ValueError(
-            f"expected a name without slashes and control characters, of at most {MAX_NAME} bytes, got {name[:80]!r}"
+            f"expected a name without slashes and control characters, of at most {MAX_NAME} bytes, got {name[:80]!a}"
         )
     return name
 
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """PATH.tmp for the new content of a file; it becomes `path` once the block ends.
+    """PATH.tmp for the new content of a file, which only this process may write; it becomes `path` at the block's end.
 
-    After an error, `path` is as it was and PATH.tmp is gone.
+    After an error, `path` is as it was and PATH.tmp is gone. ValueError while another process writes the file.
     """
     temporary = path.with_name(f"{path.name}.tmp")
-    try:
-        with named_shortage(path):
+    with claimed(path):
+        temporary.unlink(missing_ok=True)  # it could be a link to a file elsewhere
+        try:
             yield temporary
             _to_disk(temporary)
-        temporary.replace(path)
-        _to_disk(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
+            temporary.replace(path)
+            _to_disk(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def publish(finished: Path, place: Path) -> None:
     """Move a finished folder to its place, where it replaces what was there.
 
     At every moment, after a kill or a power cut too, `place` is the old folder or the new one. Where the system cannot
-    exchange two folders at once, a kill between two renames leaves the old one as PLACE.old, which `claimed` restores.
+    exchange two folders at once, a kill between two renames leaves the old one as PLACE.old.tmp, which `claimed`
+    restores.
     """
     for path in (*finished.rglob("*"), finished):
         if not path.is_symlink():
             _to_disk(path)
-    old = place.with_name(f"{place.name}.old")
+    old = _old(place)
+    shutil.rmtree(old, ignore_errors=True)  # of a process that was killed while it removed it
     if not place.exists():
         os.rename(finished, place)
     elif _exchanged(finished, place):
         os.rename(finished, old)
     else:
-        shutil.rmtree(old, ignore_errors=True)
         os.rename(place, old)
         os.rename(finished, place)
     _to_disk(place.parent)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _old(place: Path) -> Path:
+    return place.with_name(f"{place.name}.old.tmp")
 
 
 def _exchanged(one: Path, other: Path) -> bool:
@@ -204,7 +214,7 @@ def claimed(path: Path) -> Iterator[None]:
     try:
         if not path.exists():
             with contextlib.suppress(FileNotFoundError):
-                path.with_name(f"{path.name}.old").rename(path)
+                _old(path).rename(path)
         with named_shortage(path):
             yield
     finally:

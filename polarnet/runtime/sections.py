@@ -5,7 +5,7 @@ import difflib
 import functools
 import types
 import typing
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pydantic import AfterValidator, ConfigDict, ValidationError
@@ -50,6 +50,11 @@ def section(config_class: type[Section]) -> type[Section]:
 
     checked.__init__ = init
     return checked
+
+
+def section_of(name: str, fields: Mapping[str, Any]) -> type:
+    """A section with these types by field."""
+    return section(dataclasses.make_dataclass(name, fields.items(), frozen=True))
 
 
 def _absurd_number(value: Any, key: str = "") -> str | None:

@@ -4,14 +4,16 @@ import bisect
 import itertools
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field, PositiveInt
 
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG
-from polarnet.storage.parts import Store
+from polarnet.storage.groups import REPAIR
+from polarnet.storage.parts import Header, Store
 
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
 CHUNK = (
@@ -46,8 +48,8 @@ class EventStore(Store):
     FORMAT = "polarnet.events"
     VERSION = 5
     chunk = CHUNK
-    height: int
-    width: int
+    height: Annotated[PositiveInt, Field(le=MAX_SIDE)]
+    width: Annotated[PositiveInt, Field(le=MAX_SIDE)]
 
     @classmethod
     def create(
@@ -60,8 +62,6 @@ class EventStore(Store):
         sequences_per_part: int = 1,
     ) -> "EventStore":
         """Create a store to write, or resume it; see `Store.create_parts`."""
-        if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
-            raise ValueError(f"expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
         return cls.create_parts(
             path,
             sequences,
@@ -110,14 +110,15 @@ class EventStore(Store):
         record = self.record(sequence)
         if start_us is None and stop_us is None:
             (events,) = self.rows(sequence, [(0, record["offsets"][-1])])
-            return [slice_count(events, start, stop) for start, stop in itertools.pairwise(record["offsets"])]
+            channels = [slice_count(events, start, stop) for start, stop in itertools.pairwise(record["offsets"])]
+            return self._valid(sequence, channels)
         start_us = max(0, start_us or 0)
         stop_us = MAX_DURATION_US + 1 if stop_us is None else max(start_us, stop_us)
         spans = []
         for (first, end), index in zip(itertools.pairwise(record["offsets"]), record["index"], strict=True):
             before, after = bisect.bisect_left(index, start_us), bisect.bisect_left(index, stop_us)
             spans.append((first + max(0, before - 1) * INDEX_STEP, min(first + after * INDEX_STEP, end)))
-        return [slice_time(events, start_us, stop_us) for events in self.rows(sequence, spans)]
+        return self._valid(sequence, [slice_time(events, start_us, stop_us) for events in self.rows(sequence, spans)])
 
     def rows(self, sequence: str, spans: Sequence[tuple[int, int]]) -> list[Events]:
         """The events in each of the spans (start, stop) of a sequence's rows."""
@@ -132,6 +133,22 @@ class EventStore(Store):
             )
             for rows in self.read_columns(sequence, COLUMNS, spans)
         ]
+
+    def _valid(self, sequence: str, channels: list[Events]) -> list[Events]:
+        """The channels; ValueError for an event off the sensor, which would let a kernel write outside its arrays."""
+        try:
+            return [*map(validate, channels)]
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {sequence}: {error}; {REPAIR}") from None
+
+    def check_record(self, sequence: str, record: Header) -> None:
+        """ValueError for a record that no writer makes, such as a duration above 71 minutes."""
+        super().check_record(sequence, record)
+        offsets, (start, stop), duration_us = record["offsets"], record["rows"], record["duration_us"]
+        spans = len(offsets) == NUM_CHANNELS + 1 and offsets == sorted([0, *offsets[1:-1], stop - start])
+        steps = [-(-int(count) // INDEX_STEP) for count in np.diff(offsets)]
+        if not (spans and [*map(len, record["index"])] == steps and 0 < duration_us <= MAX_DURATION_US):
+            raise ValueError(f"{sequence}: expected offsets of {stop - start} events, got {offsets} in {duration_us} us")
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != NUM_CHANNELS:

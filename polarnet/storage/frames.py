@@ -4,14 +4,16 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, Integer, UInt16
+from pydantic import PositiveInt
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, check_range, floats, fractions, mask_of, whole_numbers
+from polarnet.runtime.sections import one_of
 from polarnet.runtime.splits import SPLITS
 from polarnet.storage.parts import Store
 
@@ -89,16 +91,11 @@ class Contents:
     """Whether the store marks pixels whose light is unknown."""
     sequences_per_part: int = 1
 
-    def __post_init__(self):
-        for name, split in self.splits.items():
-            if split not in SPLITS:
-                raise ValueError(f"expected {name} in one of the splits {', '.join(SPLITS)}, got {split!r}")
-
 
 class SplitStore(Store):
     """A store of `Contents`, whose fields are its attributes; a masked one has a column `valid` as well."""
 
-    splits: dict[str, str]
+    splits: dict[str, Annotated[str, one_of(SPLITS)]]
     variant_of: dict[str, str]
     masked: bool
 
@@ -135,10 +132,10 @@ class FrameStore(SplitStore):
 
     FORMAT = "polarnet.frames"
     VERSION = 6
-    n_frames: int
+    n_frames: PositiveInt
     """Maximum number of frames of a sequence."""
-    height: int
-    width: int
+    height: PositiveInt
+    width: PositiveInt
 
     @property
     def chunk(self) -> int:

@@ -37,6 +37,9 @@ def is_url(path: str | os.PathLike[str]) -> bool:
 def open_group(path: str | os.PathLike[str]) -> zarr.Group:
     """Open the Zarr group in a local folder or at an fsspec URL; FileNotFoundError if there is none."""
     name = os.fspath(path)
+    metadata = Path(name, "zarr.json")
+    if not is_url(path) and metadata.exists() and not metadata.is_file():
+        raise ValueError(f"{metadata}: expected a file, got another thing; {REPAIR}")
     try:
         store = FsspecStore.from_url(name, read_only=True) if is_url(name) else LocalStore(name, read_only=True)
         return zarr.open_group(_WholeStore(store), mode="r", zarr_format=3)

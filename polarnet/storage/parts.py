@@ -14,17 +14,20 @@ has its zarr.json, which is copied last. The same sequences give the same bytes,
 """
 
 import contextlib
+import dataclasses
+import functools
 import hashlib
 import json
 import os
 import shutil
 import tempfile
+import unicodedata
 import uuid
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
 import fsspec
 import numpy as np
@@ -32,7 +35,7 @@ import zarr
 from pydantic import PositiveInt
 
 from polarnet.runtime.files import check_name, check_room, claimed, code_digest, named_shortage, publish, sha256
-from polarnet.runtime.sections import section
+from polarnet.runtime.sections import section, section_of
 from polarnet.storage.groups import REPAIR, GrowingColumns, is_url, open_group, raise_unreadable
 
 METADATA = "zarr.json"
@@ -52,21 +55,26 @@ class StorageConfig:
 class Store:
     """Named sequences in parts. A subclass declares format, version and chunk, and adds its own keys to the header.
 
-    Every key of the header is an attribute of the store. A store can be sent to other processes.
+    A key of the header that a class annotates is an attribute of the store, checked as in a section of params.yaml. A
+    store can be sent to other processes.
     """
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
     sequences: list[str]
-    sequences_per_part: int
+    sequences_per_part: PositiveInt
     attributes: dict[str, Any]
     """Values that the store was made from, given by its creator."""
-    digests: Mapping[str, str] = {}
+    digests: dict[str, str]
     """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
+        known = {"digests": {}, **header}
+        keys = _header_class(type(self))
+        names = [field.name for field in dataclasses.fields(keys) if field.name in known]
+        checked = keys(**{name: known[name] for name in names})
+        vars(self).update({name: getattr(checked, name) for name in names})
         self.path, self.header = path, header
-        vars(self).update(header)
         _check_names(self.sequences)
         starts = range(0, len(self.sequences), self.sequences_per_part)
         self.parts: dict[str, list[str]] = {
@@ -139,14 +147,18 @@ class Store:
                 f"{path}: expected version {cls.VERSION} of {cls.FORMAT}, got version {header.get('version')!r} of "
                 "another polarnet; run `dvc repro`, which writes it again"
             )
-        if "digests" not in header:
+        if "checksum" not in header:
             raise ValueError(f"{path}: the store was never finished; run the stage that writes it again")
-        if header.get("checksum") != _checksum(header):
+        if header["checksum"] != _checksum(header):
             raise ValueError(f"{path}: the attributes in zarr.json are not what was written; {REPAIR}")
         try:
-            return cls(os.fspath(path), header)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: the attributes in zarr.json are not a store's: {error}; {REPAIR}") from error
+            store = cls(os.fspath(path), header)
+        except ValueError as error:
+            words = "; ".join(str(error).splitlines())
+            raise ValueError(f"{path}: the attributes in zarr.json are not a store's: {words}; {REPAIR}") from error
+        if store.digests.keys() != store.parts.keys():
+            raise ValueError(f"{path}: expected digests of {len(store.parts)} parts, got others; {REPAIR}")
+        return store
 
     def missing(self) -> list[str]:
         """Sequences of the parts that are not written yet, in the store's order."""
@@ -212,6 +224,8 @@ class Store:
             first, end = records[sequence]["rows"]
             start, stop = first + start, end if stop is None else min(first + stop, end)
             if name not in arrays:
+                if changed := [] if is_url(self.path) else self._changed(self.part_of(sequence), group, name):
+                    raise ValueError(f"{changed[0]} is not the file that was written")
                 arrays[name] = group[name]
             values = np.asarray(arrays[name][start:stop])
             if len(values) != max(0, stop - start):
@@ -239,17 +253,28 @@ class Store:
         problems = []
         for part, names in store.parts.items():
             try:
-                digests: Any = store._open_part(names[0])[0].attrs["sha256"]
+                changed = store._changed(part, store._open_part(names[0])[0])
             except ValueError:
-                digests = {METADATA: ""}
-            changed = [file for file, digest in digests.items() if _digest(store._url(part, file)) != digest]
+                changed = [METADATA]
             about = f"is not as it was written; it holds {', '.join(names)}; {REPAIR}"
             problems += [f"{path}: {part}/{file} {about}" for file in changed]
         return problems
 
+    def _changed(self, part: str, group: zarr.Group, column: str = "") -> list[str]:
+        """Files of a part, or of one column, that are not those that were written."""
+        digests: Any = group.attrs["sha256"]
+        files = (file for file in digests if not column or file.startswith(f"{column}/"))
+        return [file for file in files if _digest(self._url(part, file)) != digests[file]]
+
     def _is_whole(self, part: str) -> bool:
         files, name = fsspec.url_to_fs(self._url(part, METADATA))
         return files.exists(name)
+
+    def check_record(self, sequence: str, record: Header) -> None:
+        """ValueError for a record that no writer makes."""
+        start, stop = record["rows"]
+        if not 0 <= start <= stop:
+            raise ValueError(f"{sequence}: expected a span of rows, got {start} to {stop}")
 
     def _url(self, *names: str) -> str:
         """Path or fsspec URL of a part, or of a file of a part."""
@@ -261,11 +286,14 @@ class Store:
         key = os.getpid(), part
         if key not in self._opened:
             try:
-                if part in self.digests and _digest(self._url(part, METADATA)) != self.digests[part]:
+                if self.digests and _digest(self._url(part, METADATA)) != self.digests[part]:
                     raise ValueError("it is not the part that was written into this store")
                 group = open_group(self._url(part))
                 written: Any = group.attrs["sequences"]
-                self._opened[key] = group, {name: dict(written[name]) for name in self.parts[part]}, {}
+                records = {name: dict(written[name]) for name in self.parts[part]}
+                for name, record in records.items():
+                    self.check_record(name, record)
+                self._opened[key] = group, records, {}
             except Exception as error:  # Zarr raises many kinds of exceptions
                 raise_unreadable(error, f"{self.path}: {sequence}, {part}")
         return self._opened[key]
@@ -323,6 +351,8 @@ class _Part:
 def _digest(url: str) -> str | None:
     """SHA-256 of the file at a path or fsspec URL; None if it cannot be read."""
     try:
+        if not (is_url(url) or os.path.isfile(url)):  # a pipe or a device would not end
+            return None
         with fsspec.open(url) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
@@ -341,8 +371,16 @@ def _check_names(sequences: Sequence[str]) -> None:
     """ValueError unless the names of a store's sequences are at least one, each once, and safe in a path."""
     if not sequences:
         raise ValueError("expected at least one name, got none")
-    if repeated := [name for name, times in Counter(map(check_name, sequences)).items() if times > 1]:
+    alike = Counter(unicodedata.normalize("NFC", check_name(name)) for name in sequences)
+    if repeated := [name for name, times in alike.items() if times > 1]:
         raise ValueError(f"expected each name once, got {', '.join(repeated[:8])} again")
+
+
+@functools.cache
+def _header_class(store: type[Store]) -> type:
+    """Section of the keys that a kind of store annotates."""
+    hints = get_type_hints(store, include_extras=True)
+    return section_of(store.__name__, {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar})
 
 
 def _checksum(header: Header) -> str:

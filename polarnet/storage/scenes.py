@@ -5,10 +5,12 @@ Rendering starts from the stored, quantised scene, so that truth and events agre
 
 import os
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from pydantic import Field, PositiveInt
 
 from polarnet.runtime.arrays import Array, as_tensor, check_same_shape
 from polarnet.storage.frames import Contents, Polarization, SplitStore, dequantise, quantise
@@ -45,10 +47,10 @@ class SceneStore(SplitStore):
     chunk = 2**18  # pixels
     scene_of: dict[str, str]
     """Name of the scene of each sequence; several sequences may show one."""
-    largest_picture: list[int]
+    largest_picture: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
     """Height and width that no scene exceeds, pixels."""
-    sensor_height: int
-    sensor_width: int
+    sensor_height: PositiveInt
+    sensor_width: PositiveInt
     trajectory_names: list[str]
 
     @classmethod

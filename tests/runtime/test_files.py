@@ -3,8 +3,10 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 
 import pytest
+from preloaded import FORKSERVER
 
 from polarnet.runtime import files
 from polarnet.runtime.files import SUMS, changed_files, check_name, check_seal, claimed, publish, replaced, seal, sha256
@@ -70,7 +72,7 @@ def test_a_seal_must_name_every_file(sealed, emptied):
     assert changed_files(sealed) == []
 
 
-@pytest.mark.parametrize("name", ["", "..", "/tmp/x", "a/../../b", "a\\b", "a\nb", "x" * 300])
+@pytest.mark.parametrize("name", ["", "..", "/tmp/x", "a/../../b", "a\\b", "a\nb", "a\u2028b", "a\u202eb", "\ud800", "x" * 300])
 def test_a_name_that_could_be_a_place_is_refused(name):
     with pytest.raises(ValueError, match="expected a name without slashes"):
         check_name(name)
@@ -87,7 +89,8 @@ def test_a_published_folder_is_the_old_one_or_the_new_one_whenever_the_process_d
     monkeypatch.setattr(files, "_exchanged", files._exchanged if exchange else lambda one, other: False)
     for dies_at in range(10):
         shutil.rmtree(tmp_path)
-        for name in ("out", "out.partial"):
+        names = ["out", "out.partial", "out.old", *["out.old.tmp"] * exchange]  # a user's copy, and one of a killed run
+        for name in names:
             (tmp_path / name).mkdir(parents=True)
             (tmp_path / name / "a").write_text(name)
         renames = iter(range(10))
@@ -107,7 +110,33 @@ def test_a_published_folder_is_the_old_one_or_the_new_one_whenever_the_process_d
             assert (tmp_path / "out" / "a").read_text() in ("out", "out.partial")
     assert deaths == (1 if exchange else 2)
     assert (tmp_path / "out" / "a").read_text() == "out.partial"
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out.old"]
+
+
+def test_a_copy_that_a_user_put_aside_as_old_is_no_result_of_a_killed_process(tmp_path):
+    (tmp_path / "out.old").mkdir()
+    with claimed(tmp_path / "out"):
+        assert not (tmp_path / "out").exists()
+    assert (tmp_path / "out.old").exists()
+
+
+def test_a_temporary_file_that_is_a_link_changes_no_file_elsewhere_and_two_do_not_write_one_file(tmp_path):
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / "file.tmp").symlink_to(tmp_path / "victim")
+    with replaced(tmp_path / "file") as temporary:
+        temporary.write_text("new")
+        second = FORKSERVER.Process(target=replace, args=(tmp_path / "file",))
+        second.start()
+        second.join()
+        assert second.exitcode == 1
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert (tmp_path / "file").read_text() == "new"
+
+
+def replace(file):
+    with pytest.raises(ValueError, match="file: another process is writing it"), replaced(file):
+        pass
+    sys.exit(1)
 
 
 def test_bytes_are_on_the_disk_before_the_rename_and_the_name_after_it(tmp_path, monkeypatch):

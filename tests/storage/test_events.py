@@ -159,8 +159,48 @@ def test_events_that_break_the_format_are_refused_before_anything_is_written(mak
 
 
 def test_sensors_too_large_and_other_groups_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="sides of 1 to 32767 px, got 1x40000"):
+    with pytest.raises(ValueError, match="width: expected <= 32767, got 40000"):
         EventStore.create(tmp_path / "events.zarr", ["a"], 1, 40_000, {})
     zarr.open_group(tmp_path / "other.zarr", mode="w")
     assert "expected a store of format 'polarnet.events', got None" in EventStore.verify(tmp_path / "other.zarr")[0]
     assert "there is no Zarr v3 group" in EventStore.verify(tmp_path / "nothing.zarr")[0]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("x", 500, "expected x from 0 to 59"),
+        ("p", 3, "expected polarity"),
+        ("t", 0, "expected a time no earlier"),
+    ],
+)
+def test_events_that_no_writer_accepts_are_refused_when_they_are_read(tmp_path, monkeypatch, column, value, message):
+    monkeypatch.setattr(EventStore, "_check", lambda *_: None)
+    columns = {"t": [5, 6], "x": [1, 2], "y": [1, 2], "p": [1, 1]} | {column: [1, value]}
+    dtypes = {"t": torch.int64, "x": torch.int16, "y": torch.int16, "p": torch.int8}
+    events = Events(*(torch.tensor(columns[name], dtype=dtype) for name, dtype in dtypes.items()), 40, 60)
+    store = EventStore.create(tmp_path / "events.zarr", ["a"], 40, 60, {})
+    store.write("a", [events] * 4, 1000)
+    store.finish()
+    for span in ((), (0, 500)):
+        with pytest.raises(ValueError, match=rf"events\.zarr: a: event 1 of 2: {message}"):
+            EventStore.open(tmp_path / "events.zarr").read("a", *span)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"duration_us": 10**15},
+        {"offsets": [0, 2, 1, 3, 4]},
+        {"offsets": [0, 4]},
+        {"rows": [-4, 0]},
+        {"index": []},
+    ],
+)
+def test_a_record_that_no_writer_makes_is_refused(tmp_path, record):
+    store = EventStore.create(tmp_path / "events.zarr", ["a"], 40, 60, {})
+    one = Events(*torch.ones(1, 1).long(), *torch.ones(2, 1).short(), torch.ones(1).to(torch.int8), 40, 60)
+    store.write("a", [one] * 4, 1000)
+    known = store.record("a")
+    with pytest.raises(ValueError, match="a: expected (offsets|a span)"):
+        store.check_record("a", {**known, **record})

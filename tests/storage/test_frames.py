@@ -77,8 +77,8 @@ def test_splits_are_kept_in_order(finished):
     assert [store.of_split(split) for split in ("train", "val", "test")] == [["a"], [], ["b"]]
     with pytest.raises(ValueError, match="train, val, test, got 'validation'"):
         store.of_split("validation")
-    with pytest.raises(ValueError, match="expected b in one of the splits train, val, test, got None"):
-        Contents({"a": "train", "b": None})
+    with pytest.raises(ValueError, match=r"splits\.b: expected one of train, val, test, got 'none'"):
+        FrameStore.create("frames.zarr", Contents({"a": "train", "b": "none"}), 1, height=4, width=4)
 
 
 def test_a_picture_and_its_variants_are_one_picture(tmp_path):

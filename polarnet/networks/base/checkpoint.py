@@ -45,7 +45,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
     _check_suffix(path)
     record = path.with_suffix(".json")
     for file in (path, record):
-        if not file.exists():
+        if not file.is_file():
             raise FileNotFoundError(f"{file} is missing; a checkpoint is NAME.safetensors and NAME.json together")
     if (path.parent / SUMS).exists():
         check_seal(path.parent, [path.name, record.name])
@@ -83,9 +83,12 @@ def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
 
 
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Copy the tensors of a file into `network`; ValueError names a missing, surplus or differently shaped tensor."""
-    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    """Copy the tensors of a file into `network`; ValueError names a missing or surplus tensor, or another shape or type.
+    """
+    expected, shapes = (
+        {name: f"{tuple(tensor.shape)} {tensor.dtype}" for name, tensor in every.items()}
+        for every in (network.state_dict(), tensors)
+    )
     wrong = sorted(name for name in expected.keys() | shapes.keys() if expected.get(name) != shapes.get(name))
     if wrong:
         raise ValueError(
