@@ -6,6 +6,7 @@ own. A failed point writes the reason to `failure.txt`; the others continue. The
 `hydra.sweep.dir` runs a point again unless its values, its inputs and the code are those of today.
 """
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -24,8 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 from polarnet.config.origins import Run, Stage, digest
 from polarnet.config.sweep import FAILURE, mark_finished, why_unfinished
 from polarnet.config.tables import collect_rows
-from polarnet.config.tree import Config, check_ablation, hydra_command, typed
-from polarnet.runtime.files import code_digest
+from polarnet.config.tree import Config, check_ablation, hydra_command, or_exit, typed
+from polarnet.runtime.files import claimed, code_digest
 from polarnet.runtime.machine import end_with_parent
 
 # The trained network and the references for it; no other method of the benchmark depends on the training.
@@ -44,8 +45,10 @@ def main(node: DictConfig) -> None:
     job, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
     if not any(override.startswith("benchmark.methods=") for override in overrides):
         node.benchmark.methods = REFERENCE_METHODS
-    (job / FAILURE).unlink(missing_ok=True)
-    failure = _failure_of_point(node, job, overrides)
+    with contextlib.ExitStack() as held:
+        or_exit(lambda: held.enter_context(claimed(job)))
+        (job / FAILURE).unlink(missing_ok=True)
+        failure = _failure_of_point(node, job, overrides)
     if failure:
         (job / FAILURE).write_text(f"{failure}\n")
         print(f"{job}: {failure}", file=sys.stderr)

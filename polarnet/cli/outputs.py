@@ -36,8 +36,8 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
             _check_owner(each, command)
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
-        (partial / MARKER).write_text(json.dumps({"command": f"polarnet {command}"}) + "\n", encoding="utf-8")
         try:
+            (partial / MARKER).write_text(json.dumps({"command": f"polarnet {command}"}) + "\n", encoding="utf-8")
             yield partial
         except BaseException:
             _remove_without_results(partial)
@@ -48,8 +48,8 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Entries of a folder other than `WORK`; none if the folder does not exist."""
-    return [path for path in folder.iterdir() if path.name != WORK] if folder.is_dir() else []
+    """Entries of a folder other than `WORK` and the marker; none if the folder does not exist."""
+    return [path for path in folder.iterdir() if path.name not in (WORK, MARKER)] if folder.is_dir() else []
 
 
 def _check_owner(folder: Path, command: str) -> None:
@@ -71,8 +71,7 @@ def _check_owner(folder: Path, command: str) -> None:
 
 def _remove_without_results(partial: Path) -> None:
     """Remove the folder of a failed run unless it has results, which it then names."""
-    results = (path for entry in _entries(partial) for path in (entry, *entry.rglob("*")))
-    if any(path.is_file() and path.name != MARKER for path in results):
+    if any(path.is_file() for entry in _entries(partial) for path in (entry, *entry.rglob("*"))):
         print(f"files of the unfinished run: {partial}", file=sys.stderr)
     else:
         shutil.rmtree(partial)

@@ -202,11 +202,12 @@ def claimed(path: Path) -> Iterator[None]:
 
     ValueError if another process has it; OSError with the name of `path` where a disk is full.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     file = path.with_name(f"{path.name}.lock.tmp")
     lock = FileLock(file, timeout=0, is_singleton=True)
     try:
-        lock.acquire()
+        with named_shortage(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
     except Timeout:
         raise ValueError(
             f"{path}: another process is writing it; wait until that has ended, or write to another path"

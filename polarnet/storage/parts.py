@@ -127,7 +127,8 @@ class Store:
             if known is not None and is_url(path):
                 raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
             shutil.rmtree(store.path, ignore_errors=True)
-        zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(begun)
+        with named_shortage(Path(store.path)):
+            zarr.open_group(store.path, mode="a", zarr_format=3).attrs.put(begun)
         return store
 
     @classmethod
@@ -204,7 +205,8 @@ class Store:
                 f"{self.path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish"
             )
         header = {**self.header, "digests": {part: _digest(self._url(part, METADATA)) for part in self.parts}}
-        zarr.open_group(self.path, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
+        with named_shortage(Path(self.path)):
+            zarr.open_group(self.path, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
         if is_url(self.path):
             return
         for leftover in [*Path(self.path).glob("*.tmp"), *Path(self.path).glob("*.partial")]:  # of killed processes

@@ -1,6 +1,9 @@
 """Output folders hold one run."""
 
+import errno
 import json
+import os
+from pathlib import Path
 
 import pytest
 
@@ -91,3 +94,23 @@ def test_a_folder_of_another_user_is_refused_before_the_run(tmp_path, monkeypatc
     with pytest.raises(ValueError, match="out: expected a folder that you may write"):
         write(tmp_path / "out", "png/1.png")
     assert names(tmp_path) == ["out/png/0.png", f"out/{MARKER}"]
+
+
+def test_a_disk_that_is_full_at_the_first_byte_is_named_and_leaves_no_folder_that_the_next_run_refuses(
+    tmp_path, monkeypatch
+):
+    write(tmp_path / "out", "before.png")
+
+    def half(path, *_, **__):
+        path.touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", half)
+        with pytest.raises(OSError, match="out: No space left on device; make room"):
+            write(tmp_path / "out", "after.png")
+    assert names(tmp_path) == ["out/before.png", f"out/{MARKER}"]
+    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / MARKER).touch()  # of a process that was killed then
+    write(tmp_path / "out", "after.png")
+    assert names(tmp_path) == ["out/after.png", f"out/{MARKER}"]
