@@ -6,6 +6,7 @@
   damaged, the others, such as one with seed=2, serve for exchanges.
 - kills: writers are killed at a random rename. The old or the new result must be whole, and a rerun must work.
 - names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
+- pairs: two commands at once write to one place of the first of --runs (`studies.pairs`).
 
 --only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
@@ -46,10 +47,12 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import read_history
+from studies.pairs import pairs
 from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
 TEXTS = (".json", ".csv", "SHA256SUMS")
+SECTIONS = ("artefacts", "kills", "names", "pairs")
 FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
 OUTCOMES = ("refused", "harmless", *FAILURES[:4])
 Generator = np.random.Generator
@@ -285,8 +288,8 @@ NAMES = [
     "",
     "b\\..\\outside",
     "b\x00",
-    "b\n",
 ]
+NAMES += ["b\n", "b\u202e", "b\u2028"]
 COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
 """Commands that read a store whole, and what follows its name."""
 
@@ -360,15 +363,17 @@ def hostile_names(cases: int) -> dict[str, dict[str, int]]:
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--only", choices=("artefacts", "kills", "names"), help="default: all")
+    parser.add_argument("--only", choices=SECTIONS, help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=100, help="of each kind; and stores with hostile names")
+    parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
     arguments = arguments_of(parser)
     studies: dict[str, Callable[[], Mapping[str, Any]]] = {
         "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
         "kills": lambda: kills(arguments.kills),
         "names": lambda: hostile_names(arguments.kills),
+        "pairs": lambda: pairs(arguments.runs[0], arguments.pairs),
     }
     for name in [arguments.only] if arguments.only else studies:
         record, figures = machine_record(), studies[name]()
@@ -379,8 +384,8 @@ def main() -> None:
 
 
 def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
-    """Counts over all kinds of faults, kills and names."""
-    kinds = [one for name in ("artefacts", "kills", "names") for one in sections.get(name, {}).values()]
+    """Counts over all kinds of faults."""
+    kinds = [one for name in SECTIONS for one in sections.get(name, {}).values()]
     total = {what: sum(one.get(what, 0) for one in kinds) for what in FAILURES}
     return {
         "faults_injected": sum(sum(one.values()) for one in kinds),

@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 

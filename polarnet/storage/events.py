@@ -148,7 +148,9 @@ class EventStore(Store):
         spans = len(offsets) == NUM_CHANNELS + 1 and offsets == sorted([0, *offsets[1:-1], stop - start])
         steps = [-(-int(count) // INDEX_STEP) for count in np.diff(offsets)]
         if not (spans and [*map(len, record["index"])] == steps and 0 < duration_us <= MAX_DURATION_US):
-            raise ValueError(f"{sequence}: expected offsets of {stop - start} events, got {offsets} in {duration_us} us")
+            raise ValueError(
+                f"{sequence}: expected offsets of {stop - start} events, got {offsets} in {duration_us} us"
+            )
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != NUM_CHANNELS:

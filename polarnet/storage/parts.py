@@ -27,7 +27,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeVar, cast, get_origin, get_type_hints
 
 import fsspec
 import numpy as np
@@ -69,8 +69,8 @@ class Store:
     """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
-        known = {"digests": {}, **header}
-        keys = _header_class(type(self))
+        known, kind = {"digests": {}, **header}, cast("Any", type(self))
+        keys = _header_class(kind)
         names = [field.name for field in dataclasses.fields(keys) if field.name in known]
         checked = keys(**{name: known[name] for name in names})
         vars(self).update({name: getattr(checked, name) for name in names})
@@ -379,7 +379,7 @@ def _check_names(sequences: Sequence[str]) -> None:
 
 
 @functools.cache
-def _header_class(store: type[Store]) -> type:
+def _header_class(store: type[Any]) -> Any:
     """Section of the keys that a kind of store annotates."""
     hints = get_type_hints(store, include_extras=True)
     return section_of(store.__name__, {name: hint for name, hint in hints.items() if get_origin(hint) is not ClassVar})

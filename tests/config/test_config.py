@@ -127,7 +127,10 @@ def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
         ("# @package hydra.run\nseed: 1", "expected plain values without Hydra's '@package'; remove it"),
         ("#@x y\x85# @package hydra.run\nseed: 1", "expected plain values without Hydra's '@package'; remove it"),
         ("seed: !!python/object/apply:os.getcwd []", r"params\.yaml is not a file of values: could not determine a"),
-        (f"seed: {'[' * 21}{']' * 21}", r"params\.yaml is not a file of values: expected at most 10000 values, 20 deep"),
+        (
+            f"seed: {'[' * 21}{']' * 21}",
+            r"params\.yaml is not a file of values: expected at most 10000 values, 20 deep",
+        ),
         (f"seed: {'9' * 5000}", r"params\.yaml is not a file of values: Exceeds the limit"),
         ("- seed", r"params\.yaml is not a file of values: expected sections"),
         ('seed: "1', r"params\.yaml is not a file of values: while scanning a quoted scalar [^\n]*$"),

@@ -72,7 +72,9 @@ def test_a_seal_must_name_every_file(sealed, emptied):
     assert changed_files(sealed) == []
 
 
-@pytest.mark.parametrize("name", ["", "..", "/tmp/x", "a/../../b", "a\\b", "a\nb", "a\u2028b", "a\u202eb", "\ud800", "x" * 300])
+@pytest.mark.parametrize(
+    "name", ["", "..", "/tmp/x", "a/../../b", "a\\b", "a\nb", "a\u2028b", "a\u202eb", "\ud800", "x" * 300]
+)
 def test_a_name_that_could_be_a_place_is_refused(name):
     with pytest.raises(ValueError, match="expected a name without slashes"):
         check_name(name)

@@ -202,5 +202,5 @@ def test_a_record_that_no_writer_makes_is_refused(tmp_path, record):
     one = Events(*torch.ones(1, 1).long(), *torch.ones(2, 1).short(), torch.ones(1).to(torch.int8), 40, 60)
     store.write("a", [one] * 4, 1000)
     known = store.record("a")
-    with pytest.raises(ValueError, match="a: expected (offsets|a span)"):
+    with pytest.raises(ValueError, match=r"a: expected (offsets|a span)"):
         store.check_record("a", {**known, **record})

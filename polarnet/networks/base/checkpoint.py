@@ -83,8 +83,7 @@ def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
 
 
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:
-    """Copy the tensors of a file into `network`; ValueError names a missing or surplus tensor, or another shape or type.
-    """
+    """Copy the tensors of a file into `network`; ValueError names a missing, surplus or different one."""
     expected, shapes = (
         {name: f"{tuple(tensor.shape)} {tensor.dtype}" for name, tensor in every.items()}
         for every in (network.state_dict(), tensors)
