@@ -21,6 +21,7 @@ import dvc.cli
 import dvc.stage.run
 import torch
 from dvc.stage.exceptions import StageCmdFailedError
+from hydra.core.global_hydra import GlobalHydra
 from ruamel.yaml import YAML
 
 from polarnet import cli
@@ -43,6 +44,7 @@ TINY: dict[str, dict[str, Any]] = {
     "baselines": {"e2v": {"crop": [24, 32], "lpips": 0}},
 }
 """Values of params.yaml that make a training short."""
+MAX_DELAY_S = 6.0
 TO_PLACE = ["--out", PLACE]
 COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
     "recover": (
@@ -59,7 +61,7 @@ COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
     "view": (["view", STORE, "--no-browser", *TO_PLACE], ["--sequence=FIRST", "--sequence=LAST"], ("",)),
     "trial": (["stages.trial", f"hydra.run.dir={PLACE}", "benchmark.methods=[ours]"],
               ["loss.mse=1.0", "loss.mse=2.0"], ("train/ours", "finished.json")),
-    "dvc repro": (["dvc", "repro", "-q", "-f", "-s", "--no-run-cache", "--no-commit", "train"], ["", ""], ("",)),
+    "dvc repro": (["dvc", "repro", "-f", "-s", "--no-run-cache", "--no-commit", "train"], ["", ""], ("",)),
 }  # fmt: skip
 """Words of each command, words that make two results differ, and the files or folders that hold a result."""
 
@@ -79,6 +81,7 @@ def run(words: list[str], output: Path) -> None:
     name, *arguments = words
     sys.argv = words
     if name.startswith("stages."):
+        GlobalHydra.instance().clear()  # of a trial, if this is one of its stages
         with mock.patch("stages.trial._failure", stage_failure):
             sys.exit(sys.modules[name].main())
     if name == "dvc":
@@ -163,7 +166,9 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
             print(name, f"{seconds[name]:.1f} s", flush=True)
         for number, (one, other) in itertools.product(range(cases), both):
             clear()
-            delay = generator_for(number, f"{one} and {other}", "delay").uniform(0, 1.2 * seconds[one])
+            delay = generator_for(number, f"{one} and {other}", "delay").uniform(
+                0, min(1.2 * seconds[one], MAX_DELAY_S)
+            )
             what, message = outcome((one, other), delay, Path(folder), expected)
             counts[f"{one} and {other} at once"][what] += 1
             if what not in ("waited", "refused"):
