@@ -278,18 +278,8 @@ WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]
     "store": (write_store, read_events),
 }
 """Writers that are killed while they replace an old result with a new one, and readers of the values there."""
-NAMES = [
-    "../outside",
-    "../../../outside",
-    "{root}/outside",
-    "b/../../outside",
-    "..",
-    ".",
-    "",
-    "b\\..\\outside",
-    "b\x00",
-]
-NAMES += ["b\n", "b\u202e", "b\u2028"]
+NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
+NAMES += ["b\x00", "b\n", "b\u202e", "b\u2028"]
 COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
 """Commands that read a store whole, and what follows its name."""
 
