@@ -166,18 +166,6 @@ def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
         assert time.perf_counter() - written < 1.0
 
 
-@pytest.mark.parametrize(("name", "events", "counts"), [
-    ("stale_first_3", 400, {"stale": 3}), ("live_glitch_20s", 1999, {"time_glitches": 1}),
-    ("live_one_wrong_time", 399, {"time_glitches": 1}), ("live_clock_reset", 800, {"clock_resets": 1}),
-    ("late_run_10", 1990, {"time_glitches": 10}), ("comment_first", 400, {}),
-])  # fmt: skip
-def test_recordings_that_failed_live_go_on(shared, name, events, counts):
-    with (shared / "cases" / "recordings" / f"{name}.txt").open("rb") as file:
-        live = LiveLines(file, name, MOSAIC, idle_s=0.0)
-        assert sum(len(channel) for piece in live for channel in piece.channels) == events
-    assert {kind: count for kind, count in live.counts.items() if count} == counts
-
-
 @pytest.fixture
 def dv():
     return pytest.importorskip("dv_processing", reason="the extra live is not installed")

@@ -163,7 +163,8 @@ def open_csv(path: Path, choices: Choices) -> Source:
 
     def blocks(counts: Counter[str]) -> Iterator[Block]:
         for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
-            row, column, _, p, t = np.ascontiguousarray(rows[rows[:, 3] != 0].T)
+            changed = rows[:, 3] != 0
+            row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
             counts["no_change"] += len(rows) - len(t)
             yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
 

@@ -236,7 +236,22 @@ def _parse(buffer, start, shift, rows):
             elif kind == _SEPARATOR_CODE:
                 place += 1
             else:
-                value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
+                missing = shift[column] if column < columns else 0
+                value, end, most = 0, place, min(size, place + _DIGITS - 1)  # first the common case: digits
+                while end < most and 48 <= buffer[end] <= 57:
+                    value = 10 * value + buffer[end] - 48
+                    end += 1
+                whole = place < end < most
+                if whole and missing > 0 and buffer[end] == 46:  # ... maybe with a point
+                    end += 1
+                    while end < most and missing > 0 and 48 <= buffer[end] <= 57:
+                        value = 10 * value + buffer[end] - 48
+                        end += 1
+                        missing -= 1
+                if whole and end < most and _KINDS[buffer[end]] and value < _LIMITS[missing]:
+                    value, place = value * _POWERS[missing], end
+                else:
+                    value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
                 good = good and whole
                 if column < columns:
                     rows[filled, column] = value
@@ -254,19 +269,6 @@ def _parse(buffer, start, shift, rows):
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
-    value, end, most = 0, place, min(size, place + _DIGITS - 1)  # first the common case: digits, maybe with a point
-    while end < most and 48 <= buffer[end] <= 57:
-        value = 10 * value + buffer[end] - 48
-        end += 1
-    missing = shift
-    if start < end < most and shift > 0 and buffer[end] == 46:
-        end += 1
-        while end < most and missing > 0 and 48 <= buffer[end] <= 57:
-            value = 10 * value + buffer[end] - 48
-            end += 1
-            missing -= 1
-    if start < end < most and _KINDS[buffer[end]] and value < _LIMITS[missing]:
-        return value * _POWERS[missing], end, True
     letter = buffer[place] | 32
     if letter == 116 or letter == 102:  # True or False
         while place < size and not _KINDS[buffer[place]]:
