@@ -293,10 +293,8 @@ def peak_mib() -> float:
 def peak_of_command(command: str, path: Path) -> float:
     """Peak memory in MiB of a command of polarnet on a file."""
     with tempfile.TemporaryDirectory() as folder:
-        out = {"inspect": ["--out", folder], "convert": [f"{folder}/out.h5"], "recover": ["--out", f"{folder}/out"]}[
-            command
-        ]
-        if polarnet([command, str(path), *out, *COMMANDS[command]]):
+        words = [word.replace("OUT", f"{folder}/out.h5") for word in COMMANDS[command]]
+        if polarnet([command, str(path), *words]):
             raise RuntimeError(f"polarnet {command} {path.name} failed")
     return round(peak_mib(), 1)
 

@@ -112,10 +112,13 @@ class RecordingReader:
     def __iter__(self) -> Iterator[Events]:
         return self.chunks(self._chunk_events)
 
-    def chunks(self, size: int) -> Iterator[Events]:
-        """Iterate with another number of events in a chunk."""
+    def chunks(self, size: int = CHUNK_EVENTS, bridged_us: int = 0) -> Iterator[Events]:
+        """Iterate with another number of events in a chunk.
+
+        A clock that was set anew in the first `bridged_us` is no error: events go on 10 ms after the newest one.
+        """
         self.repairs.clear()
-        for block in _cut(repaired(self.path.name, self._source, self.repairs), size):
+        for block in _cut(repaired(self.path.name, self._source, self.repairs, bridged_us), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)
 

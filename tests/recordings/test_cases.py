@@ -75,7 +75,7 @@ LIVE = {
 }
 """Events and repairs, read live."""
 REFUSED = {
-    "clock_reset.txt": "time goes back by 198641 us.*--stop 198641us",
+    "clock_reset.txt": "time goes back by 198641 us.*--stop 198642us.*--start 208641us",
     "live_clock_reset.txt": "time goes back by 1000198641 us",
     "aedat4_stereo.aedat4": "--part with one of 0, 1",
     "stereo.bag": "--part with one of /davis/left/events, /davis/right/events",

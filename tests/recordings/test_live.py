@@ -150,7 +150,7 @@ def test_wrong_times_are_dropped_and_a_reset_of_the_clock_goes_on_with_one_warni
     t = torch.cat([piece.channels[1].t for piece in pieces])
     assert len(t) == len(times) - 6
     assert (t.diff() >= 0).all()
-    assert sum("frames go on as after a pause" in message for message in caplog.messages) == 1
+    assert sum("events go on as after a pause" in message for message in caplog.messages) == 1
 
 
 def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
