@@ -100,8 +100,8 @@ class Clock:
     """Puts events in time order and leaves out those with wrong times: the one rule for files and live input.
 
     A time more than 10 ms before or after the newest one is judged by the events that follow it (docs/recordings.md has
-    the cases). Repairs are added to `counts`. A clock that was set anew ends a file with a RecordingError; `live` input,
-    and a file in the first `bridged_us`, go on as after a pause of 10 ms.
+    the cases). Repairs are added to `counts`. A clock that was set anew ends a file with a RecordingError; `live`
+    input, and a file in the first `bridged_us`, go on as after a pause of 10 ms.
     """
 
     def __init__(self, name: str, counts: Counter[str], *, live: bool = False, bridged_us: int = 0):
@@ -209,8 +209,8 @@ class Clock:
         start = f" --start {self._bridged_us}us" if self._bridged_us else ""
         return (
             f"{self.name}: after event {self._judged}, time goes back by {before - after} us, from {before} to {after} "
-            f"us, and stays there for {min(len(rest.t), MAX_RUN)} events: the camera's clock was set anew, or recordings "
-            f"were joined. `{command}{start} --stop {elapsed_us + 1}us` writes the part before it, "
+            f"us, and stays there for {min(len(rest.t), MAX_RUN)} events: the camera's clock was set anew, or "
+            f"recordings were joined. `{command}{start} --stop {elapsed_us + 1}us` writes the part before it, "
             f"`{command} --start {elapsed_us + LATE_US}us` the part after it"
         )
 
