@@ -11,6 +11,7 @@ Sections of docs/results/recordings.json, each measured in processes of their ow
 """
 
 import argparse
+import functools
 import json
 import os
 import subprocess
@@ -164,8 +165,8 @@ def write_store(path: Path, some: Parts) -> None:
 
 def whole(some: Parts) -> Events:
     """All events."""
-    columns = (torch.cat(values) for values in zip(*([part.t, part.x, part.y, part.p] for part in some), strict=True))
-    return Events(*columns, HEIGHT, WIDTH)
+    t, x, y, p = map(torch.cat, zip(*([part.t, part.x, part.y, part.p] for part in some), strict=True))
+    return Events(t, x, y, p, HEIGHT, WIDTH)
 
 
 def write_celex5(write: Callable[[Path, Events], object]) -> Writer:
@@ -266,7 +267,8 @@ def speed_of_reader(name: str) -> dict[str, float]:
             if polarnet(["inspect", str(path), *given, "--out", folder]):
                 raise RuntimeError(f"{name}: polarnet inspect failed")
 
-        read(small), inspect(small)
+        read(small)
+        inspect(small)
         count = read(large)
         if count < 0.99 * COUNT:
             raise RuntimeError(f"{name}: expected {COUNT} events, read {count}")
@@ -290,16 +292,16 @@ def peak_mib() -> float:
     return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024
 
 
-def peak_of_command(command: str, path: Path) -> float:
+def peak_of_command(command: str, path: str) -> float:
     """Peak memory in MiB of a command of polarnet on a file."""
     with tempfile.TemporaryDirectory() as folder:
         words = [word.replace("OUT", f"{folder}/out.h5") for word in COMMANDS[command]]
-        if polarnet([command, str(path), *words]):
-            raise RuntimeError(f"polarnet {command} {path.name} failed")
+        if polarnet([command, path, *words]):
+            raise RuntimeError(f"polarnet {command} {path} failed")
     return round(peak_mib(), 1)
 
 
-def peak_of_array(path: Path) -> float:
+def peak_of_array(path: str) -> float:
     """Peak memory in MiB of `read_recording`."""
     read_recording(path)
     return round(peak_mib(), 1)
@@ -319,7 +321,8 @@ def measure_readers(formats: list[str]) -> tuple[dict[str, Any], dict[str, Any]]
 
 def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
     """Peak memory of the commands, and bytes an event of an array."""
-    rows, arrays = [], []
+    rows: list[dict[str, Any]] = []
+    arrays: list[dict[str, Any]] = []
     for form in MEMORY_FORMS:
         peaks: dict[int, dict[str, float]] = {}
         for size in MEMORY_SIZES:
@@ -356,8 +359,8 @@ def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
 ONE: dict[str, Callable[[str], Any]] = {
     "reader": speed_of_reader,
     "writer": speed_of_writer,
-    "array": lambda path: peak_of_array(Path(path)),
-    **{name: lambda path, name=name: peak_of_command(name, Path(path)) for name in COMMANDS},
+    "array": peak_of_array,
+    **{name: functools.partial(peak_of_command, name) for name in COMMANDS},
 }
 
 

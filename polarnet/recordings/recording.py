@@ -2,7 +2,6 @@
 
 import logging
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from polarnet.recordings.source import (
     Block,
     CameraFrames,
     Choices,
+    Counts,
     RecordingError,
     Source,
     joined,
@@ -105,7 +105,7 @@ class RecordingReader:
         self.format = form
         self.height = source.height
         self.width = source.width
-        self.repairs: Counter[str] = Counter()
+        self.repairs = Counts()
         self._source = source
         self._chunk_events = chunk_events
 
@@ -118,6 +118,7 @@ class RecordingReader:
         A clock that was set anew in the first `bridged_us` is no error: events go on 10 ms after the newest one.
         """
         self.repairs.clear()
+        self.repairs.share_read = 0.0
         for block in _cut(repaired(self.path.name, self._source, self.repairs, bridged_us), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet.recordings.formats import hdf5, lines, prophesee
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
 from studies.celex5_writer import write_celex5_csv
 
 SAMPLES = {
@@ -126,3 +128,21 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         open_recording(tmp_path / "e.bag")
     with pytest.raises(RecordingError, match="the file states a height of 12 px, 13 was given"):
         read_recording(tmp_path / "e.txt", height=13, width=18)
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.txt.gz", "a.raw", "a.h5"])
+def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, make_random_events):
+    monkeypatch.setattr(lines, "BLOCK_BYTES", 2000)
+    monkeypatch.setattr(prophesee, "EVT_BLOCK_WORDS", 200)
+    monkeypatch.setattr(hdf5, "BLOCK_EVENTS", 100)
+    write = {".txt": write_text, ".raw": write_evt3, ".h5": write_hdf5}
+    path = tmp_path / name.removesuffix(".gz")
+    write[path.suffix](path, make_random_events(1, 1000, 10**6, 40, 50), 10**6)
+    if name.endswith(".gz"):
+        path = path.rename(tmp_path / "plain")
+        (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
+    reader = open_recording(tmp_path / name, chunk_events=10)
+    shares = [reader.repairs.share_read for _ in reader]
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < 0.5 or name.endswith(".gz")
+    assert 0.8 < shares[-1] <= 1

@@ -12,7 +12,6 @@ A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in
 """
 
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, no_type_check
@@ -22,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size, start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, sensor_size, start_of, unpacked
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
@@ -103,7 +102,7 @@ def open_bin(path: Path, choices: Choices) -> Source:
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
         last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
         for _, package in _packages(path, counts):
@@ -128,7 +127,7 @@ def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
     """The full pictures of a BIN file, in order; RecordingError for other or damaged files."""
-    counts: Counter[str] = Counter()
+    counts = Counts()
     for t_ms, package in _packages(path, counts):
         if package[-1] == 0:
             if len(package) != PICTURE_BYTES:
@@ -161,7 +160,7 @@ def open_csv(path: Path, choices: Choices) -> Source:
         )
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
             changed = rows[:, 3] != 0
             row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
@@ -206,7 +205,7 @@ def _opened(path: Path) -> Header:
     return header
 
 
-def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
+def _packages(path: Path, counts: Counts) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
     """The computer's time in milliseconds, and the bytes, of each package."""
     header = _opened(path)
     with unpacked(path) as file:

@@ -3,13 +3,21 @@
 Its EVT3 decoder holds times back where the sensor's clock steps back, so `prophesee` reads EVT2 and EVT3.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, chosen_part, sensor_size
+from polarnet.recordings.source import (
+    Block,
+    CameraFrames,
+    Choices,
+    Counts,
+    RecordingError,
+    Source,
+    chosen_part,
+    sensor_size,
+)
 
 FAERY = Library("faery", "faery", "recordings", "the file is damaged")
 
@@ -17,7 +25,7 @@ FAERY = Library("faery", "faery", "recordings", "the file is damaged")
 def open_event_stream(path: Path, choices: Choices) -> Source:
     """Open the events of Event Stream."""
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for columns in ask(FAERY, path, isolated_worker.event_stream_events):
             yield Block(*columns)
 
@@ -33,7 +41,7 @@ def open_aedat4(path: Path, choices: Choices) -> Source:
     streams = ask_once(FAERY, path, isolated_worker.aedat4_streams)
     stream = chosen_part(path, choices.part, list(streams), "stream of events")
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for columns in ask(FAERY, path, isolated_worker.aedat4_events, stream):
             if columns is None:
                 counts["cut_tail"] += 1

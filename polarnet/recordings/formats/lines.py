@@ -6,7 +6,6 @@ tools. Lines that begin with # or % are comments.
 
 import itertools
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, no_type_check
@@ -19,6 +18,7 @@ from polarnet.recordings.source import (
     BLOCK_EVENTS,
     Block,
     Choices,
+    Counts,
     RecordingError,
     Source,
     byte_blocks,
@@ -86,7 +86,7 @@ def open_text(path: Path, choices: Choices) -> Source:
     decimals = [0] * len(order)
     decimals[order.index("t")] = MICROSECONDS if _in_seconds(path, start, order.index("t")) else 0
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, tuple(decimals), start, counts):
             yield Block(*(np.ascontiguousarray(rows[:, order.index(name)]) for name in COLUMNS))
 
@@ -148,7 +148,7 @@ def _in_seconds(path: Path, start: int, place: int) -> bool:
 
 
 def number_blocks(
-    path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counter[str]
+    path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counts
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
     """Read the lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
 
@@ -201,7 +201,7 @@ def words_of(line: bytes) -> list[bytes]:
 
 
 def rows_of(
-    data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counter[str], damage: str
+    data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counts, damage: str
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
     """Parse complete lines to rows of numbers, as in `number_blocks`; other lines are counted as `damage`."""
     buffer = np.frombuffer(data, np.uint8)

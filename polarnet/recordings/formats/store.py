@@ -1,11 +1,19 @@
 """Read one channel of one sequence from polarnet's own event store."""
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 from polarnet.events.stream import Events
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, chosen_part, sensor_size
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    Choices,
+    Counts,
+    RecordingError,
+    Source,
+    chosen_part,
+    sensor_size,
+)
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 
@@ -31,9 +39,11 @@ def open_store(path: Path, choices: Choices) -> Source:
     channel = ANGLES.index(angle)
     height, width = sensor_size(path, choices, store.height, store.width)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         try:
-            for events in channel_chunks(store, sequence, channel):
+            total = max(1, store.count(sequence)[channel])
+            for number, events in enumerate(channel_chunks(store, sequence, channel)):
+                counts.share_read = min(1.0, number * BLOCK_EVENTS / total)
                 yield Block(*(getattr(events, name).numpy() for name in "txyp"))
         except ValueError as error:
             raise RecordingError(str(error)) from error
