@@ -307,23 +307,22 @@ def peak_of_array(path: str) -> float:
     return round(peak_mib(), 1)
 
 
-def measure_readers(formats: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Speed of every reader and writer."""
-    figures: dict[str, Any] = {"files": {}, "writers": {}}
+def measure_readers(formats: Iterable[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Speed of these readers beside the known ones, and of every writer."""
+    files, writers = known.get("files", {}), {}
     for name in formats:
-        figures["files"][name] = in_own_process("studies.recordings", "--one", "reader", name)
-        print(name, figures["files"][name], flush=True)
+        files[name] = in_own_process("studies.recordings", "--one", "reader", name)
+        print(name, files[name], flush=True)
     for form in FORMS:
-        figures["writers"][form] = in_own_process("studies.recordings", "--one", "writer", form)
-        print(form, figures["writers"][form], flush=True)
-    return figures, {"readers_mev_per_cpu_s": {name: one["read"] for name, one in figures["files"].items()}}
+        writers[form] = in_own_process("studies.recordings", "--one", "writer", form)
+        print(form, writers[form], flush=True)
+    return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
 
 
-def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
-    """Peak memory of the commands, and bytes an event of an array."""
-    rows: list[dict[str, Any]] = []
-    arrays: list[dict[str, Any]] = []
-    for form in MEMORY_FORMS:
+def measure_memory(forms: Iterable[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Peak memory of the commands, and bytes an event of an array, beside the known ones of other formats."""
+    rows, arrays = known.get("commands", {}), known.get("bytes_per_event", {})
+    for form in forms:
         peaks: dict[int, dict[str, float]] = {}
         for size in MEMORY_SIZES:
             with tempfile.TemporaryDirectory() as folder:
@@ -334,13 +333,10 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
                 }
             print(form, size, peaks[size], flush=True)
         for name in COMMANDS:
-            mib = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
-            rows.append({"format": form, "command": name, "peak_mib": mib})
+            rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
         few, many = MEMORY_SIZES[1:]
-        arrays.append(
-            {"format": form, "bytes": round((peaks[many]["array"] - peaks[few]["array"]) * MIB / (many - few), 2)}
-        )
-    return {"commands": rows, "arrays": arrays}, {"bytes_per_event_max": max(one["bytes"] for one in arrays)}
+        arrays[form] = round((peaks[many]["array"] - peaks[few]["array"]) * MIB / (many - few), 2)
+    return {"commands": rows, "bytes_per_event": arrays}, {"bytes_per_event_max": max(arrays.values())}
 
 
 def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
@@ -368,24 +364,24 @@ def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--sections", nargs="*", choices=SECTIONS, default=SECTIONS)
-    parser.add_argument("--formats", nargs="*", choices=list(FILES), default=list(FILES))
+    everything = [*FILES, *MEMORY_FORMS]
+    parser.add_argument("--formats", nargs="*", choices=everything, default=everything)
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
     if arguments.one:
         task, about = arguments.one
         print(json.dumps(ONE[task](about)))
         return
-    measure = {
-        "readers": lambda: measure_readers(arguments.formats),
-        "memory": measure_memory,
-        "cases": measure_cases,
-    }
     for section in arguments.sections:
-        record = machine_record()
-        figures, headlines = measure[section]()
+        record, known = machine_record(), read_results(ROOT, "recordings").get(section, {})
+        if section == "readers":
+            figures, headlines = measure_readers([name for name in FILES if name in arguments.formats], known)
+        elif section == "memory":
+            figures, headlines = measure_memory([name for name in MEMORY_FORMS if name in arguments.formats], known)
+        else:
+            figures, headlines = measure_cases()
         if arguments.write:
-            known = read_results(ROOT, "recordings").get("readers", {}) if section == "readers" else {}
-            write_section("recordings", section, {**known, **figures}, record, headlines)
+            write_section("recordings", section, figures, record, headlines)
 
 
 if __name__ == "__main__":
