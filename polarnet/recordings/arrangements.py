@@ -16,7 +16,7 @@ import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, concatenate, select, slice_count
-from polarnet.recordings.recording import Recording, RecordingReader, log_repairs, open_recording
+from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
@@ -166,12 +166,6 @@ def open_plain(path: Path, open_file: Open = open_recording) -> Channels:
     """One channel in pieces: all events of a camera without polarizers."""
     reader = open_file(path)
     return Channels(reader.height, reader.width, lambda: ([events] for events in reader), [reader], number=1)
-
-
-def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
-    """One channel: all events of a camera without polarizers; time starts with its first event."""
-    events = read(path).events
-    return [shifted(events, int(events.t[0])) if len(events) else events]
 
 
 def shifted(events: Events, origin_us: int) -> Events:

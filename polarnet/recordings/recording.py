@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,11 +66,15 @@ FORMATS = {
     },
     "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, takes=PART),
     "aedat4": Format(
-        "AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.open_aedat4, faery.aedat4_frames, takes=PART
+        "AEDAT4 of iniVation",
+        signature(b"#!AER-DAT4"),
+        partial(faery.open_faery, aedat4=True),
+        faery.aedat4_frames,
+        PART,
     ),
     "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, takes=PART),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
-    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.open_event_stream),
+    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), partial(faery.open_faery, aedat4=False)),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),

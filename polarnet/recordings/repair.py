@@ -4,6 +4,7 @@ Every repair is counted. The outcome of a file depends on the file alone, not on
 """
 
 import logging
+from collections import Counter
 from collections.abc import Collection, Iterator
 from typing import no_type_check
 
@@ -65,7 +66,7 @@ def _darker(p: np.ndarray) -> int | None:
     return None if zeros == minus_ones == 0 else -1 if minus_ones > zeros else 0
 
 
-def usable(block: Block, height: int, width: int, darker: int | None, counts: Counts) -> Bool[np.ndarray, " n"]:
+def usable(block: Block, height: int, width: int, darker: int | None, counts: Counter[str]) -> Bool[np.ndarray, " n"]:
     """Which events have a polarity, 1 or `darker`, and are on the sensor; the others are added to `counts`."""
     known = block.p == 1
     if darker is not None:
@@ -76,7 +77,7 @@ def usable(block: Block, height: int, width: int, darker: int | None, counts: Co
     return known & inside
 
 
-def refuse_much_damage(name: str, counts: Counts, events: int, safe: Collection[str] = SAFE) -> None:
+def refuse_much_damage(name: str, counts: Counter[str], events: int, safe: Collection[str] = SAFE) -> None:
     """RecordingError if more than 1 % of the events (and 8) have the same damage, unless it is `safe`."""
     for kind, words in REPAIRS.items():
         if kind not in safe and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
@@ -103,7 +104,7 @@ class Clock:
     input, and a file in the first `bridged_us`, go on as after a pause of 10 ms.
     """
 
-    def __init__(self, name: str, counts: Counts, *, live: bool = False, bridged_us: int = 0):
+    def __init__(self, name: str, counts: Counter[str], *, live: bool = False, bridged_us: int = 0):
         self.name = name
         self.counts = counts
         self._live, self._bridged_us = live, bridged_us

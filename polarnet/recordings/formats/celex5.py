@@ -12,9 +12,10 @@ A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in
 """
 
 import struct
+from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, no_type_check
+from typing import NamedTuple, no_type_check
 
 import numba
 import numpy as np
@@ -46,19 +47,8 @@ ROW, COLUMN = 2, 1  # kinds of items
 CSV_COLUMNS = 5
 
 
-class Header(NamedTuple):
-    """The first 12 bytes of a file."""
-
-    data_type: int
-    loop_a: int
-    """Mode of the sensor outside loop mode."""
-    loop_b: int
-    loop_c: int
-    event_format: int
-    hour: int
-    minute: int
-    second: int
-    packages: int
+Header = namedtuple("Header", "data_type loop_a loop_b loop_c event_format hour minute second packages")
+"""The first 12 bytes of a file; loop_a is the sensor's mode outside loop mode."""
 
 
 class Picture(NamedTuple):
@@ -223,22 +213,15 @@ def _packages(path: Path, counts: Counts) -> Iterator[tuple[int | None, UInt8[np
                 counts["cut_tail"] += 1
                 return
             t_ms = None
-            if header.data_type & IMU:
-                t_ms = _skip_imu(path, file)
+            if header.data_type & IMU and len(stamp := file.read(STAMP.size)) == STAMP.size:
+                t_ms, samples = STAMP.unpack(stamp)
+                if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
+                    raise RecordingError(
+                        f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged"
+                    )
+                file.seek(samples * IMU_SAMPLE_BYTES, 1)
             yield t_ms, np.frombuffer(package, np.uint8)
             number += 1
-
-
-def _skip_imu(path: Path, file: BinaryIO) -> int | None:
-    """Skip the time and the IMU's samples; returns the time in milliseconds, or None if the file ends early."""
-    stamp = file.read(STAMP.size)
-    if len(stamp) < STAMP.size:
-        return None
-    t_ms, samples = STAMP.unpack(stamp)
-    if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
-        raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
-    file.seek(samples * IMU_SAMPLE_BYTES, 1)
-    return t_ms
 
 
 @numba.njit(nogil=True, cache=True)
