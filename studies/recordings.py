@@ -17,7 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -133,13 +133,13 @@ def peak_of_array(path: str) -> float:
     return round(peak_mib(), 1)
 
 
-def measure_readers(formats: Iterable[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Speed of these readers beside the known ones, and of every writer."""
-    files, writers = known.get("files", {}), {}
-    for name in formats:
+def measure_readers(formats: Collection[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Speed of the readers and writers of these formats, beside the known ones."""
+    files, writers = known.get("files", {}), known.get("writers", {})
+    for name in (name for name in FILES if name in formats):
         files[name] = in_own_process("studies.recordings", "--one", "reader", name)
         print(name, files[name], flush=True)
-    for form in FORMS:
+    for form in (form for form in FORMS if form in formats):
         writers[form] = in_own_process("studies.recordings", "--one", "writer", form)
         print(form, writers[form], flush=True)
     return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
@@ -190,7 +190,7 @@ def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--sections", nargs="*", choices=SECTIONS, default=SECTIONS)
-    everything = [*FILES, *MEMORY_FORMS]
+    everything = list(dict.fromkeys([*FILES, *FORMS]))
     parser.add_argument("--formats", nargs="*", choices=everything, default=everything)
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
@@ -201,7 +201,7 @@ def main() -> None:
     for section in arguments.sections:
         record, known = machine_record(), read_results(ROOT, "recordings").get(section, {})
         if section == "readers":
-            figures, headlines = measure_readers([name for name in FILES if name in arguments.formats], known)
+            figures, headlines = measure_readers(arguments.formats, known)
         elif section == "memory":
             figures, headlines = measure_memory([name for name in MEMORY_FORMS if name in arguments.formats], known)
         else:
