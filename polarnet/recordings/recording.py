@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -189,16 +189,21 @@ def read_recording(
     tensor([3], dtype=torch.int16)
     """
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
-    columns = [np.empty(0, kind) for kind in (np.int64, np.int16, np.int16, np.int8)]
-    for chunk in reader:
-        for column, name in zip(columns, "txyp", strict=True):
-            count = len(column)
-            column.resize(count + len(chunk), refcheck=False)  # in place, so that events never lie in memory twice
-            column[count:] = getattr(chunk, name).numpy()
+    (events,) = whole(([chunk] for chunk in reader), reader.height, reader.width, 1)
     log_repairs(reader)
-    t, x, y, p = map(torch.from_numpy, columns)
-    events = Events(t, x, y, p, reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
+
+
+def whole(blocks: Iterable[Sequence[Events]], height: int, width: int, number: int) -> list[Events]:
+    """All events of `number` channels that come in blocks; they never lie in memory twice."""
+    tables = [[np.empty(0, kind) for kind in (np.int64, np.int16, np.int16, np.int8)] for _ in range(number)]
+    for block in blocks:
+        for columns, events in zip(tables, block, strict=True):
+            for column, name in zip(columns, "txyp", strict=True):
+                count = len(column)
+                column.resize(count + len(events), refcheck=False)
+                column[count:] = getattr(events, name).numpy()
+    return [Events(t, x, y, p, height, width) for t, x, y, p in (map(torch.from_numpy, columns) for columns in tables)]
 
 
 def log_repairs(reader: RecordingReader) -> None:
