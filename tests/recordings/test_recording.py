@@ -1,4 +1,5 @@
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
 from studies.celex5_writer import write_celex5_csv
+from studies.recording_files import FILES
 
 SAMPLES = {
     "aedat4/tonic_sample.aedat4": ("aedat4", 111_954, 240, 320),
@@ -146,3 +148,16 @@ def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, 
     assert shares == sorted(shares)
     assert 0 < shares[0] < 0.5 or name.endswith(".gz")
     assert 0.8 < shares[-1] <= 1
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FILES if kind != "celex5_bin"])
+def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, make_random_events, same_events):
+    suffix, write = FILES[kind]
+    events = make_random_events(1, 30_000, 10**6, 260, 346)
+    events = replace(events, height=800, width=1280) if kind == "celex5_csv" else events
+    events = replace(events, t=events.t - events.t[0]) if kind == "event_stream" else events  # as faery writes them
+    write(tmp_path / f"e{suffix}", events)
+    part = {"store": "135", "m3ed": "left", "mvsec": "left"}.get(kind)
+    recording = read_recording(tmp_path / f"e{suffix}", part=part)
+    assert (kind.split()[0].rstrip(","), recording.repairs) == (recording.format, {})
+    assert same_events(recording.events, events)
