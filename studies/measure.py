@@ -58,7 +58,7 @@ class Study(NamedTuple):
 
 STUDIES = {
     "simulation": Study("speed_of_simulation", "emulation", "models"),
-    "readers": Study("speed_of_readers", "recordings", "readers"),
+    "recordings": Study("recordings", "recordings", "readers"),
     "network": Study("speed_of_network", "robustness", "speed"),
     "rig": Study("rig", "recordings", "rig"),
     "recorded": Study("recorded", "recorded", "simulated", takes=("published",)),

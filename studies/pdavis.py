@@ -33,6 +33,7 @@ from studies.study import arguments_of, command_line, machine_record, write_sect
 MOSAIC_TEXT = "90 45 / 135 0"
 POLARIZERS_DEG, TRUE_DOLP = (0, 30, 90), 0.8
 SQUARE = 64  # pixels of the photograph, of which every other square lies behind the polarizer
+WARM_UP = 5  # windows, as in the benchmark
 EXPOSURE_US, RESET_LEVEL = 8000, 900
 JAER_HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
 
@@ -86,7 +87,7 @@ def simulate(folder: Path, polarizer_deg: int) -> Path:
         pictures.append(folder / f"polarizer{polarizer_deg}_{angle}.png")
         write_png(pictures[-1], np.repeat(light.numpy()[..., None], 3, axis=2).astype(np.float32), 16)
     made = folder / f"simulated_{polarizer_deg}"
-    size = ["synthesize.sensor_height=130", "synthesize.sensor_width=173", "synthesize.duration_s=0.5"]
+    size = ["synthesize.sensor_height=130", "synthesize.sensor_width=173", "synthesize.duration_s=2"]
     if polarnet(["simulate", *map(str, pictures), "--out", str(made), "--no-preview", *size]):
         raise SystemExit("polarnet simulate failed")
     return made
@@ -114,6 +115,12 @@ def error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> flo
     return abs(math.degrees(float(doubled.angle())) / 2)
 
 
+def largest_error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> float:
+    """The largest `error_deg` of a frame, of those that the benchmark would score."""
+    frames = zip(aolp[WARM_UP:], dolp[WARM_UP:], strict=True)
+    return max(error_deg(*frame, polarizer_deg) for frame in frames)
+
+
 def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
     """Errors of the AoLP that `polarnet recover` and the recording's own frames give."""
     out = recording.with_suffix("")
@@ -122,11 +129,13 @@ def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
         raise SystemExit(f"polarnet {' '.join(command)} failed")
     group = zarr.open_group(out / "recovered.zarr", mode="r")
     aolp, dolp = (torch.from_numpy(np.asarray(group[name]).astype(np.float64)) for name in ("aolp", "dolp"))
+    aolp *= math.pi / 2**16
     truth = read_truth(recording, MOSAIC)
     return {
         "polarizer_deg": polarizer_deg,
         "format": recording.suffix.removeprefix("."),
-        "aolp_error_deg": error_deg(aolp * (math.pi / 2**16), dolp, polarizer_deg),
+        "aolp_error_deg": error_deg(aolp, dolp, polarizer_deg),
+        "frame_aolp_error_deg_max": largest_error_deg(aolp, dolp, polarizer_deg),
         "frames_aolp_error_deg": error_deg(truth.aolp[truth.valid], truth.dolp[truth.valid], polarizer_deg),
     }
 

@@ -1,6 +1,7 @@
 """Write bags of ROS 1 and ROS 2 with events, for tests of the reader; needs the package rosbags."""
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,29 @@ def write_bag(
                 bag.write(connection, k, serialize(message(some), array))
 
 
-def write_packets(path: Path, height: int, width: int, packets: Sequence[tuple[str, int, bytes]]) -> None:
+def array_bytes(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
+    """The events of an EventArray as ROS 1 serializes them: their number, then 13 bytes each."""
+    records = np.empty(len(t), [("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
+    for name, values in zip(("x", "y", "s", "ns", "p"), (x, y, t // 10**6, t % 10**6 * 1000, p), strict=True):
+        records[name] = values
+    return struct.pack("<I", len(t)) + records.tobytes()
+
+
+def write_arrays(path: Path, height: int, width: int, contents: Iterable[bytes]) -> None:
+    """Write a ROS 1 bag with an EventArray of dvs_msgs for each of `array_bytes`."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name, text in (("Event", EVENT), ("EventArray", EVENT_ARRAY)):
+        store.register(get_types_from_msg(text.replace("builtin_interfaces/Time", ROS1_TIME), f"dvs_msgs/msg/{name}"))
+    with Writer(path) as bag:
+        connection = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        for k, content in enumerate(contents):
+            bag.write(connection, k, struct.pack("<6I", k, 0, 0, 0, height, width) + content)
+
+
+def write_packets(path: Path, height: int, width: int, packets: Iterable[tuple[str, int, bytes]]) -> None:
     """Write a ROS 2 bag of EventPacket of event_camera_msgs: encoding, time base and content of each."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -132,33 +132,22 @@ def _medians(values, pixel, fallback) -> Float64[np.ndarray, " pixels"]:
     return np.where(counts > 0, values[order][middle], fallback)
 
 
-class PolarityThresholds(NamedTuple):
-    """Thresholds of both polarities."""
+def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> tuple[PixelThresholds, PixelThresholds]:
+    """Thresholds of both polarities, ON and OFF, with the leak taken out of the increments."""
 
-    on: PixelThresholds
-    off: PixelThresholds
-
-
-def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> PolarityThresholds:
-    """Thresholds of both polarities, with the leak taken out of the increments."""
-    first = _thresholds(data, data.increment, 0.0, pixels)
-    if leak_hz == 0:
-        return first
-    on = np.where(np.isfinite(first.on.threshold), first.on.threshold, np.nanmedian(first.on.threshold))
-    leaked = leak_hz * data.duration_s * on[data.pixel]
-    return _thresholds(data, data.increment + np.where(data.on, leaked, -leaked), leak_hz, pixels)
-
-
-def _thresholds(
-    data: Increments, increment: Float64[np.ndarray, " n"], leak_hz: float, pixels: int
-) -> PolarityThresholds:
-    short = leak_hz * data.duration_s < LEAKED
-    return PolarityThresholds(
-        *(
+    def pair(leaked: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]) -> list[PixelThresholds]:
+        increment = data.increment + np.where(data.on, leaked, -leaked)
+        return [
             pixel_thresholds(increment[chosen], data.pixel[chosen], data.block[chosen], pixels)
-            for chosen in (data.on & short, ~data.on & short)
-        )
-    )
+            for chosen in (data.on & usable, ~data.on & usable)
+        ]
+
+    on, off = pair(np.zeros(len(data.on)), np.ones(len(data.on), np.bool_))
+    if leak_hz:
+        threshold = np.where(np.isfinite(on.threshold), on.threshold, np.nanmedian(on.threshold))
+        leaked = leak_hz * data.duration_s
+        on, off = pair(leaked * threshold[data.pixel], leaked < LEAKED)
+    return on, off
 
 
 def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
@@ -183,7 +172,7 @@ def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
             except ValueError:
                 return 2.0
             total = 0.0
-            for of, thresholds in ((data.on, pair.on), (~data.on, pair.off)):
+            for of, thresholds in zip((data.on, ~data.on), pair, strict=True):
                 valid = of & np.isfinite(thresholds.threshold[data.pixel])
                 total += misfit(data.increment[valid], data.pixel[valid], thresholds.threshold) if valid.any() else 1.0
             return total

@@ -1,7 +1,7 @@
 """The simulated twin of a recording: the same light through the fitted sensor, and how alike the two are."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -95,7 +95,7 @@ def compare(
     if isinstance(light, MovingLight):
         within = (light.t_us >= start_us) & (light.t_us <= stop_us)
         light = MovingLight(light.frames[within, top : top + height, left : left + width], light.t_us[within])
-    frames, t_us = _frames_of(light, start_us, stop_us, height, width)
+    frames, t_us = frames_of(light, start_us, stop_us, height, width)
     twin = emulated(frames, t_us, replace(sensor, hot_pixel_share=0.0), seed_for(seed, "twin", "sensor"))
     hot = hot_pixels(event_counts(part), duration_s, HOT_FACTOR)
     pair = {"recording": without_pixels(part, hot), "twin": without_pixels(twin, hot)}
@@ -121,52 +121,37 @@ def compare(
 
 
 def emulated(
-    pieces: Iterator[Float32[np.ndarray, "k h w"]], t_us: Float64[np.ndarray, " n"], sensor: EmulatorConfig, key: int
+    frames: Float32[np.ndarray, "n h w"], t_us: Float64[np.ndarray, " n"], sensor: EmulatorConfig, key: int
 ) -> Events:
-    """Events of one channel under light that comes in pieces."""
+    """Events of one channel under light, in pieces of bounded memory; `frames` may be a view by `frames_of`."""
     state: SensorState | None = None
-    parts, position = [], 0
-    for frames in pieces:
-        times = t_us[position : position + len(frames)]
-        (events,), state = emulate(np.ascontiguousarray(frames)[:, None], times, sensor, key, state)
-        position += len(frames)
+    parts, step = [], max(2, CHUNK_PIXELS // frames[0].size)
+    for k in range(0, len(frames), step):
+        some = np.ascontiguousarray(frames[k : k + step])[:, None]
+        (events,), state = emulate(some, t_us[k : k + step], sensor, key, state)
         parts.append(events)
     return concatenate(parts)
 
 
-def constant_frames(
-    light: Float64[np.ndarray, " n"], height: int, width: int
-) -> Iterator[Float32[np.ndarray, "k h w"]]:
-    """Light that is the same on all pixels, in pieces of consecutive frames."""
-    step = max(2, CHUNK_PIXELS // (height * width))
-    for k in range(0, len(light), step):
-        some = light[k : k + step].astype(np.float32)
-        yield np.broadcast_to(some[:, None, None], (len(some), height, width))
-
-
-def flicker_light(
-    flicker: Flicker, start_us: float, stop_us: float
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Times and light of a flicker, 64 steps per cycle."""
-    steps = math.ceil((stop_us - start_us) * 1e-6 * flicker.frequency_hz * STEPS_PER_CYCLE)
-    t_us = np.linspace(start_us, stop_us, steps + 1)
-    phase = 2e-6 * math.pi * flicker.frequency_hz * (t_us - start_us)
-    return t_us, flicker.level * (1 + flicker.contrast * np.sin(phase))
-
-
-def _frames_of(
-    light: MovingLight | Flicker | float, start_us: int, stop_us: int, height: int, width: int
-) -> tuple[Iterator[Float32[np.ndarray, "k h w"]], Float64[np.ndarray, " n"]]:
-    """Frames of the light on the pixels, in pieces, and their times."""
+def frames_of(
+    light: MovingLight | Flicker | float | int,
+    start_us: float | int,
+    stop_us: float | int,
+    height: int,
+    width: int,
+) -> tuple[Float32[np.ndarray, "n h w"], Float64[np.ndarray, " n"]]:
+    """Frames of the light on the pixels (of a flicker 64 a cycle), and their times."""
     if isinstance(light, MovingLight):
-        frames, step = light.frames, max(2, CHUNK_PIXELS // (height * width))
-        return (frames[k : k + step] for k in range(0, len(frames), step)), light.t_us
+        return light.frames, light.t_us
     if isinstance(light, Flicker):
-        t_us, values = flicker_light(light, start_us, stop_us)
+        steps = math.ceil((stop_us - start_us) * 1e-6 * light.frequency_hz * STEPS_PER_CYCLE)
+        t_us = np.linspace(start_us, stop_us, steps + 1)
+        phase = 2e-6 * math.pi * light.frequency_hz * (t_us - start_us)
+        values = light.level * (1 + light.contrast * np.sin(phase))
     else:
         t_us = np.append(np.arange(start_us, stop_us, STATIC_STEP_US, dtype=np.float64), stop_us)
         values = np.full(len(t_us), light)
-    return constant_frames(values, height, width), t_us
+    return np.broadcast_to(values.astype(np.float32)[:, None, None], (len(t_us), height, width)), t_us
 
 
 def _distance(recording: np.ndarray, twin: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.recording import RecordingReader, open_recording
 from polarnet.recordings.repair import MAX_TIME
+from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import FORMS, export_store
 from polarnet.runtime.files import replaced
 from polarnet.storage.events import EventStore
@@ -69,18 +70,25 @@ class _Span:
         self._start_us, self._stop_us = start_us, stop_us
 
     def chunks(self, reader: RecordingReader) -> Iterator[Events]:
-        """Its events, in chunks, the first of which may be empty; times count from its start."""
+        """Its events, in chunks, the first of which may be empty; times count from its start.
+
+        A clock that was set anew before the span's start is no error, see `RecordingReader.chunks`.
+        """
         yield Events.empty(reader.height, reader.width)
-        first_us = None
-        for chunk in reader:
-            first_us = int(chunk.t[0]) if first_us is None else first_us
-            self.origin_us = first_us + self._start_us
-            stop_us = MAX_TIME if self._stop_us is None else first_us + self._stop_us
-            part = shifted(slice_time(chunk, self.origin_us, stop_us), self.origin_us)
-            self.count += len(part)
-            yield part
-            if chunk.t[-1] >= stop_us:
-                return
+        first_us = last_us = stop_us = None
+        try:
+            for chunk in reader.chunks(bridged_us=self._start_us):
+                first_us, last_us = int(chunk.t[0]) if first_us is None else first_us, int(chunk.t[-1])
+                self.origin_us = first_us + self._start_us
+                stop_us = MAX_TIME if self._stop_us is None else first_us + self._stop_us
+                part = shifted(slice_time(chunk, self.origin_us, stop_us), self.origin_us)
+                self.count += len(part)
+                yield part
+                if last_us >= stop_us:
+                    return
+        except RecordingError:
+            if last_us is None or last_us + 1 != stop_us:  # else the span ends where the damage begins
+                raise
 
 
 def onnx(options: argparse.Namespace) -> None:

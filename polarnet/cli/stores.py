@@ -14,7 +14,7 @@ from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
 from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
-from polarnet.recordings.recording import is_recording, open_recording, read_recording
+from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
 from polarnet.reports.recordings import draw_hot_pixels, recording_picture
@@ -55,10 +55,10 @@ def inspect(options: argparse.Namespace) -> None:
 
 def view(options: argparse.Namespace) -> None:
     """Write a page that plays a store, a recording or a recovery, and open it."""
-    read = functools.partial(read_recording, part=options.part, **reading_of(options))
+    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
     if options.part is not None or is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
-        films = [recording_film(options.path, read)]
+        films = [recording_film(options.path, open_file)]
     else:
         refuse(options, "a store or a folder", READING)
         films = films_of(options.path, options.sequence or ())

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, concatenate, select, slice_count
-from polarnet.recordings.recording import Recording, RecordingReader, log_repairs, open_recording
+from polarnet.events.stream import Events, select, slice_count
+from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
@@ -62,12 +62,10 @@ class Channels:
 
     def whole(self) -> list[Events]:
         """All events; logs a warning for each kind of damage."""
-        pieces = [piece.channels for piece in self]
+        channels = whole((piece.channels for piece in self), self.height, self.width, self.number)
         for reader in self.readers:
             log_repairs(reader)
-        if not pieces:
-            return [Events.empty(self.height, self.width)] * self.number
-        return [concatenate(channel) for channel in zip(*pieces, strict=True)]
+        return channels
 
 
 def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int | None = None) -> Iterator[Piece]:
@@ -166,12 +164,6 @@ def open_plain(path: Path, open_file: Open = open_recording) -> Channels:
     """One channel in pieces: all events of a camera without polarizers."""
     reader = open_file(path)
     return Channels(reader.height, reader.width, lambda: ([events] for events in reader), [reader], number=1)
-
-
-def read_plain(path: Path, read: Callable[[Path], Recording]) -> list[Events]:
-    """One channel: all events of a camera without polarizers; time starts with its first event."""
-    events = read(path).events
-    return [shifted(events, int(events.t[0])) if len(events) else events]
 
 
 def shifted(events: Events, origin_us: int) -> Events:

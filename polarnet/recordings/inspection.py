@@ -1,7 +1,7 @@
 """Summarise a recording: events, rates, duration, hot pixels, gaps, empty rows, an image of the busiest part."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import no_type_check
 
 import numba
@@ -18,28 +18,28 @@ EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough no
 WORST_PIXELS = 4  # hot pixels named in the findings
 
 
-@dataclass(frozen=True)
+@dataclass
 class Inspection:
     """Summary of a recording's content."""
 
     format: str
     counts: Int64[np.ndarray, "h w"]
     """Events of each pixel."""
-    on: int
-    """Number of ON events."""
-    start_us: int
-    stop_us: int
-    """Times of the first and the last event; 0 without events."""
     hot: Bool[np.ndarray, "h w"]
     busiest: Events
     """The part that took the least time: consecutive events, 0.15 per pixel, that do not start with the recording."""
-    gap_us: int
+    on: int = 0
+    """Number of ON events."""
+    start_us: int = 0
+    stop_us: int = 0
+    """Times of the first and the last event; 0 without events."""
+    gap_us: int = 0
     """The longest time without events."""
-    gap_start_us: int
-    repairs: Mapping[str, int]
-    pictures: int
+    gap_start_us: int = 0
+    repairs: Mapping[str, int] = field(default_factory=dict)
+    pictures: int = 0
     """Number of full pictures between events, or in a file without events."""
-    first_picture: UInt16[np.ndarray, "h w"] | None
+    first_picture: UInt16[np.ndarray, "h w"] | None = None
 
     @property
     def events(self) -> int:
@@ -52,47 +52,30 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
 
     `hot_pixel_factor` is the `factor` of `polarnet.recordings.noise.hot_pixels`. RecordingError if reading fails.
     """
-    counts, on = np.zeros((reader.height, reader.width), np.int64), 0
-    size = max(1, round(EVENTS_PER_PIXEL * counts.size))
-    start_us = stop_us = gap_us = gap_start_us = 0
-    busiest, least = Events.empty(reader.height, reader.width), (True, np.inf)
-    began = False
+    shape = reader.height, reader.width
+    one = Inspection(reader.format, np.zeros(shape, np.int64), np.zeros(shape, np.bool_), Events.empty(*shape))
+    size, least = max(1, round(EVENTS_PER_PIXEL * one.counts.size)), (True, np.inf)
     for events in reader.chunks(size):
-        t = events.t.numpy()
-        first, last = int(t[0]), int(t[-1])
-        start_us, stop_us, began = (start_us, stop_us, True) if began else (first, first, True)
-        brighter, silence_us, silence_end_us = _tally(
-            t, events.x.numpy(), events.y.numpy(), events.p.numpy(), counts, stop_us
-        )
-        on += brighter
-        if silence_us > gap_us:
-            gap_us, gap_start_us = silence_us, silence_end_us - silence_us
-        stop_us = last
+        first, last = int(events.t[0]), int(events.t[-1])
+        if not len(one.busiest):
+            one.start_us = one.stop_us = first
+        columns = (getattr(events, name).numpy() for name in "txyp")
+        brighter, silence_us, silence_end_us = _tally(*columns, one.counts, one.stop_us)
+        one.on += brighter
+        if silence_us > one.gap_us:
+            one.gap_us, one.gap_start_us = silence_us, silence_end_us - silence_us
+        one.stop_us = last
         # many pixels fire when a camera or its simulation starts, which is not the scene's motion
-        duration = (first == start_us or len(t) < size, last - first)
-        if duration < least or not len(busiest):
-            busiest, least = events, duration
-    pictures, first_picture = 0, None
+        duration = (first == one.start_us or len(events) < size, last - first)
+        if duration < least or not len(one.busiest):
+            one.busiest, least = events, duration
     if reader.format == "celex5_bin":
         for picture in celex5_pictures(reader.path):
-            first_picture = picture.intensity if pictures == 0 else first_picture
-            pictures += 1
-    hot = hot_pixels(counts, (stop_us - start_us) * 1e-6, hot_pixel_factor)
-    repairs = {kind: count for kind, count in reader.repairs.items() if count}
-    return Inspection(
-        reader.format,
-        counts,
-        on,
-        start_us,
-        stop_us,
-        hot,
-        busiest,
-        gap_us,
-        gap_start_us,
-        repairs,
-        pictures,
-        first_picture,
-    )
+            one.first_picture = picture.intensity if one.pictures == 0 else one.first_picture
+            one.pictures += 1
+    one.hot = hot_pixels(one.counts, (one.stop_us - one.start_us) * 1e-6, hot_pixel_factor)
+    one.repairs = {kind: count for kind, count in reader.repairs.items() if count}
+    return one
 
 
 @numba.njit(nogil=True, cache=True)

@@ -15,7 +15,6 @@ import re
 import stat
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from queue import Empty, Queue
 from threading import Thread
@@ -30,7 +29,7 @@ from polarnet.events.stream import MAX_SIDE, Events
 from polarnet.recordings.arrangements import Piece, pieces_of
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import Clock, refuse_much_damage, usable
-from polarnet.recordings.source import SAFE, Block, RecordingError
+from polarnet.recordings.source import SAFE, Block, Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.terminal.installation import installation
 
@@ -47,7 +46,7 @@ class _Stream:
 
     def __init__(self, name: str, height: int, width: int, mosaic: Mosaic | None):
         self.height, self.width = (side // 2 if mosaic else side for side in (height, width))
-        self.counts: Counter[str] = Counter()
+        self.counts = Counts()
         self._sensor, self._mosaic = (height, width), mosaic
         self._clock = Clock(name, self.counts, live=True)
         self._since = 0.0

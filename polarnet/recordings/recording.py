@@ -2,9 +2,9 @@
 
 import logging
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from polarnet.recordings.source import (
     Block,
     CameraFrames,
     Choices,
+    Counts,
     RecordingError,
     Source,
     joined,
@@ -65,11 +66,15 @@ FORMATS = {
     },
     "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, takes=PART),
     "aedat4": Format(
-        "AEDAT4 of iniVation", signature(b"#!AER-DAT4"), faery.open_aedat4, faery.aedat4_frames, takes=PART
+        "AEDAT4 of iniVation",
+        signature(b"#!AER-DAT4"),
+        partial(faery.open_faery, aedat4=True),
+        faery.aedat4_frames,
+        PART,
     ),
     "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, takes=PART),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
-    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), faery.open_event_stream),
+    "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), partial(faery.open_faery, aedat4=False)),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),
@@ -105,17 +110,21 @@ class RecordingReader:
         self.format = form
         self.height = source.height
         self.width = source.width
-        self.repairs: Counter[str] = Counter()
+        self.repairs = Counts()
         self._source = source
         self._chunk_events = chunk_events
 
     def __iter__(self) -> Iterator[Events]:
         return self.chunks(self._chunk_events)
 
-    def chunks(self, size: int) -> Iterator[Events]:
-        """Iterate with another number of events in a chunk."""
+    def chunks(self, size: int = CHUNK_EVENTS, bridged_us: int = 0) -> Iterator[Events]:
+        """Iterate with another number of events in a chunk.
+
+        A clock that was set anew in the first `bridged_us` is no error: events go on 10 ms after the newest one.
+        """
         self.repairs.clear()
-        for block in _cut(repaired(self.path.name, self._source, self.repairs), size):
+        self.repairs.share_read = 0.0
+        for block in _cut(repaired(self.path.name, self._source, self.repairs, bridged_us), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)
 
@@ -180,16 +189,21 @@ def read_recording(
     tensor([3], dtype=torch.int16)
     """
     reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
-    columns = [np.empty(0, kind) for kind in (np.int64, np.int16, np.int16, np.int8)]
-    for chunk in reader:
-        for column, name in zip(columns, "txyp", strict=True):
-            count = len(column)
-            column.resize(count + len(chunk), refcheck=False)  # in place, so that events never lie in memory twice
-            column[count:] = getattr(chunk, name).numpy()
+    (events,) = whole(([chunk] for chunk in reader), reader.height, reader.width, 1)
     log_repairs(reader)
-    t, x, y, p = map(torch.from_numpy, columns)
-    events = Events(t, x, y, p, reader.height, reader.width)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
+
+
+def whole(blocks: Iterable[Sequence[Events]], height: int, width: int, number: int) -> list[Events]:
+    """All events of `number` channels that come in blocks; they never lie in memory twice."""
+    tables = [[np.empty(0, kind) for kind in (np.int64, np.int16, np.int16, np.int8)] for _ in range(number)]
+    for block in blocks:
+        for columns, events in zip(tables, block, strict=True):
+            for column, name in zip(columns, "txyp", strict=True):
+                count = len(column)
+                column.resize(count + len(events), refcheck=False)
+                column[count:] = getattr(events, name).numpy()
+    return [Events(t, x, y, p, height, width) for t, x, y, p in (map(torch.from_numpy, columns) for columns in tables)]
 
 
 def log_repairs(reader: RecordingReader) -> None:

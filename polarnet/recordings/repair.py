@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from polarnet.events.streaming import MAX_PAUSE_US
-from polarnet.recordings.source import REPAIRS, SAFE, Block, RecordingError, Source, joined
+from polarnet.recordings.source import REPAIRS, SAFE, Block, Counts, RecordingError, Source, joined
 
 LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
@@ -33,13 +33,13 @@ NOTHING = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int
 logger = logging.getLogger(__name__)
 
 
-def repaired(name: str, source: Source, counts: Counter[str]) -> Iterator[Block]:
+def repaired(name: str, source: Source, counts: Counts, bridged_us: int = 0) -> Iterator[Block]:
     """The events of a source, t as int64, x and y as int16, p as int8; repairs are added to `counts`.
 
     RecordingError, beginning with `name`, where damage is not safe to repair, after the events before it: more than 1 %
-    of the events (and 8) of one kind, or a clock that was set anew.
+    of the events (and 8) of one kind, or a clock that was set anew `bridged_us` after the first event or later.
     """
-    clock = Clock(name, counts)
+    clock = Clock(name, counts, bridged_us=bridged_us)
     darker: int | None = None
     events = 0
     for block in source.blocks(counts):
@@ -100,14 +100,14 @@ class Clock:
     """Puts events in time order and leaves out those with wrong times: the one rule for files and live input.
 
     A time more than 10 ms before or after the newest one is judged by the events that follow it (docs/recordings.md has
-    the cases). Repairs are added to `counts`. A clock that was set anew ends a file with a RecordingError; `live` input
-    goes on as after a pause of 10 ms.
+    the cases). Repairs are added to `counts`. A clock that was set anew ends a file with a RecordingError; `live`
+    input, and a file in the first `bridged_us`, go on as after a pause of 10 ms.
     """
 
-    def __init__(self, name: str, counts: Counter[str], *, live: bool = False):
+    def __init__(self, name: str, counts: Counter[str], *, live: bool = False, bridged_us: int = 0):
         self.name = name
         self.counts = counts
-        self._live = live
+        self._live, self._bridged_us = live, bridged_us
         self._settled = False  # whether stale events of the camera's last run can no longer come
         self._judged = self._dropped = 0
         self._first: int | None = None
@@ -139,11 +139,11 @@ class Clock:
             if not self._settled and self._judged <= (FEW if ahead else MAX_STALE):
                 self.counts["stale"] += sum(len(one.t) for one in accepted)
                 accepted, self._newest = [NOTHING], None
-            elif self._live:
-                rest = self._set_anew(rest)
-            elif ahead:
+            elif ahead and not self._live:
                 self.counts["pauses"] += 1
                 self._newest = int(rest.t[0])
+            elif self._live or self._elapsed_us(accepted) < self._bridged_us:
+                rest = self._set_anew(rest)
             else:
                 self._settled = True
                 yield self._ready(_joined(accepted), final=True)
@@ -189,7 +189,7 @@ class Clock:
         shift_us = self._newest + LATE_US - int(rest.t[0])
         if not self.counts["clock_resets"]:
             logger.warning(
-                "%s: after event %d, the camera's clock goes from %d to %d us: frames go on as after a pause of %d ms; "
+                "%s: after event %d, the camera's clock goes from %d to %d us: events go on as after a pause of %d ms; "
                 "later resets are only counted",
                 *(self.name, self._judged, self._newest - self._shift_us, int(rest.t[0]) - self._shift_us),
                 LATE_US // 1000,
@@ -198,13 +198,20 @@ class Clock:
         self._shift_us += shift_us
         return rest._replace(t=rest.t + shift_us)
 
+    def _elapsed_us(self, accepted: list[Block]) -> int:
+        """Time from the first event to the newest one."""
+        firsts = [int(one.t[0]) for one in accepted if len(one.t)] if self._first is None else [self._first]
+        return (self._newest or 0) - min(firsts, default=self._newest or 0)
+
     def _refusal(self, rest: Block) -> str:
-        newest, t_us = self._newest or 0, int(rest.t[0])
-        kept_us = newest - (newest if self._first is None else self._first)
+        before, after = ((one or 0) - self._shift_us for one in (self._newest, int(rest.t[0])))
+        elapsed_us, command = self._elapsed_us([]), f"polarnet convert {self.name} OUT"
+        start = f" --start {self._bridged_us}us" if self._bridged_us else ""
         return (
-            f"{self.name}: after event {self._judged}, time goes back by {newest - t_us} us, from {newest} to {t_us} "
+            f"{self.name}: after event {self._judged}, time goes back by {before - after} us, from {before} to {after} "
             f"us, and stays there for {min(len(rest.t), MAX_RUN)} events: the camera's clock was set anew, or "
-            f"recordings were joined. `polarnet convert {self.name} OUT --stop {kept_us}us` writes the part before it"
+            f"recordings were joined. `{command}{start} --stop {elapsed_us + 1}us` writes the part before it, "
+            f"`{command} --start {elapsed_us + LATE_US}us` the part after it"
         )
 
 

@@ -52,6 +52,13 @@ class RecordingError(ValueError):
     """A file cannot be read; the message gives the reason and a remedy."""
 
 
+class Counts(Counter[str]):
+    """Count of each kind of repair, and how far the file is read."""
+
+    share_read = 0.0
+    """0 to 1; 0 where the format does not tell."""
+
+
 class Block(NamedTuple):
     """Events as stored in the file: columns of equal length and any number type."""
 
@@ -88,7 +95,7 @@ class Source:
 
     height: int
     width: int
-    blocks: Callable[[Counter[str]], Iterator[Block]]
+    blocks: Callable[[Counts], Iterator[Block]]
 
 
 class CameraFrames(NamedTuple):
@@ -127,15 +134,16 @@ def unpacked(path: Path) -> Iterator[Any]:
             raise RecordingError(f"{path.name}: the archive cannot be unpacked: {error}") from error
 
 
-def byte_blocks(path: Path, start: int, size: int, counts: Counter[str]) -> Iterator[bytearray]:
+def byte_blocks(path: Path, start: int, size: int, counts: Counts) -> Iterator[bytearray]:
     """The content from byte `start` on, unpacked, `size` bytes at a time; a cut archive is counted as `cut_tail`."""
     with unpacked(path) as file:
-        block = bytearray()
+        block, on_disk = bytearray(), getattr(file, "fileobj", file)  # of gzip, the packed file
         try:
             file.seek(start)
             while data := file.read1(size - len(block)):
                 block += data
                 if len(block) == size:
+                    counts.share_read = min(1.0, on_disk.tell() / path.stat().st_size)
                     yield block
                     block = bytearray()
         except EOFError:
@@ -146,12 +154,10 @@ def byte_blocks(path: Path, start: int, size: int, counts: Counter[str]) -> Iter
 
 def start_of(path: Path, size: int) -> bytes:
     """The first bytes of a file, unpacked."""
-    return bytes(next(byte_blocks(path, 0, size, Counter()), b""))
+    return bytes(next(byte_blocks(path, 0, size, Counts()), b""))
 
 
-def word_blocks(
-    path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counter[str]
-) -> Iterator[np.ndarray]:
+def word_blocks(path: Path, start: int, dtype: np.dtype | str, words: int, counts: Counts) -> Iterator[np.ndarray]:
     """The words of a file from byte `start` on, `words` at a time; a cut word at the end is counted as `cut_tail`."""
     size = np.dtype(dtype).itemsize
     for data in byte_blocks(path, start, words * size, counts):

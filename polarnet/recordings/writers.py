@@ -3,6 +3,7 @@
 `polarnet.recordings` reads them all.
 """
 
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,6 +14,7 @@ import numba
 import numpy as np
 
 from polarnet.events.stream import Events, slice_count
+from polarnet.recordings.formats.store import channel_chunks
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 from polarnet.terminal.installation import installation
@@ -20,7 +22,6 @@ from polarnet.terminal.progress import ProgressBar
 
 HDF5_CHUNK = 2**16  # events
 BLOCK = 2**18  # events converted at once
-READ_EVENTS = 2**20  # events read at once from a store
 EVT3_MAX_SIDE = 2**11  # x and y have 11 bits
 EVT3_WORDS = 2**20  # 16-bit words written at once
 MAX_TEXT_US = 10**18  # seconds of 12 digits
@@ -229,7 +230,8 @@ def export_store(
         (folder / sequence).mkdir(parents=True, exist_ok=True)
         for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
             path = folder / sequence / f"polarizer_{angle:03d}{suffix}"
-            write(path, _chunks(store, sequence, channel), duration_us)
+            nothing = Events.empty(store.height, store.width)  # so that a channel without events has a size
+            write(path, itertools.chain([nothing], channel_chunks(store, sequence, channel)), duration_us)
     contents = {
         "form": form,
         "height": store.height,
@@ -240,14 +242,6 @@ def export_store(
         "attributes": store.attributes,
     }
     (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
-
-
-def _chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
-    """The events of one channel, in chunks that begin with an empty one."""
-    yield Events.empty(store.height, store.width)
-    first, end = store.record(sequence)["offsets"][channel : channel + 2]
-    for start in range(first, end, READ_EVENTS):
-        yield from store.rows(sequence, [(start, min(start + READ_EVENTS, end))])
 
 
 def h5py_module() -> Any:

@@ -51,6 +51,11 @@ class Input(NamedTuple):
     live: bool = False
     """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
 
+    def shares_read(self) -> dict[str, str]:
+        """The part of the files that is read, in words; empty where their formats do not tell."""
+        shares = [getattr(counts, "share_read", 0.0) for counts in self.repairs.values()]
+        return {"read": f"{sum(shares) / len(shares):.0%}"} if any(shares) else {}
+
 
 class Frame(NamedTuple):
     """Prediction at the end of a window, on the CPU, with its timing."""
@@ -180,8 +185,8 @@ def recover(
             latency_ms.append(1000 * frame.latency_s)
             bar.update(frame.window.stop_us - last_us)
             last_us = frame.window.stop_us
-            latency = {"latency": f"{latency_ms[-1]:.1f} ms"} if source.live else {}
-            bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **latency)
+            more = {"latency": f"{latency_ms[-1]:.1f} ms"} if source.live else source.shares_read()
+            bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **more)
     run_s, stream_s = time.perf_counter() - started, last_us * 1e-6
     length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
     step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"

@@ -1,7 +1,7 @@
 """Films of everything that polarnet writes or reads: stores, folders of a simulation or recovery, recordings."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
-from polarnet.recordings.arrangements import read_plain
-from polarnet.recordings.recording import Recording, is_recording, read_recording
+from polarnet.recordings.arrangements import Open, open_plain
+from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, dequantise
@@ -26,9 +26,9 @@ APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "
 """Quantity of each array of recovered.zarr and truth.zarr."""
 
 
-def recording_film(path: Path, read: Callable[[Path], Recording] = read_recording) -> Film:
-    """The film of a camera's file, which `read` reads."""
-    return _events_film(path.name, read_plain(path, read), None)
+def recording_film(path: Path, open_file: Open = open_recording) -> Film:
+    """The film of a camera's file, which `open_file` opens."""
+    return _events_film(path.name, open_plain(path, open_file).whole(), None)
 
 
 def films_of(path: Path, sequences: Sequence[str] = ()) -> list[Film]:

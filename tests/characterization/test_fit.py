@@ -9,14 +9,7 @@ import pytest
 from polarnet.characterization.fit import fit_sensor
 from polarnet.characterization.intervals import between_shot_noise_us, piled_up_us
 from polarnet.characterization.light import Flicker, KnownLight, MovingLight
-from polarnet.characterization.twin import (
-    compare,
-    constant_frames,
-    emulated,
-    fitted_parameters,
-    fitted_sensor,
-    flicker_light,
-)
+from polarnet.characterization.twin import compare, emulated, fitted_parameters, fitted_sensor, frames_of
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recordings.noise import event_counts
 from polarnet.simulation.presets import SENSORS
@@ -33,7 +26,7 @@ HEIGHT, WIDTH = 24, 32
 @pytest.fixture(scope="module")
 def static():
     t_us = np.arange(0, 121, 5) * 1e6
-    return emulated(constant_frames(np.full(len(t_us), 200.0), HEIGHT, WIDTH), t_us, TRUTH, 3)
+    return emulated(np.broadcast_to(np.float32(200), (len(t_us), HEIGHT, WIDTH)), t_us, TRUTH, 3)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +37,7 @@ def moving() -> KnownLight:
     leaves = (255 * np.clip(cv2.GaussianBlur(leaves, (0, 0), 1.0), 0.04, 1)).astype(np.float32)
     places = margin + 60 * np.sin(np.outer(t_us * 1e-6, [1.0, 0.77]) + np.array([0, 1]))
     light = np.stack([cv2.warpAffine(leaves, np.array([[1, 0, -x], [0, 1, -y]]), (WIDTH, HEIGHT)) for x, y in places])
-    return KnownLight("moving", emulated(iter([light]), t_us, TRUTH, 3), MovingLight(light[::2], t_us[::2]))
+    return KnownLight("moving", emulated(light, t_us, TRUTH, 3), MovingLight(light[::2], t_us[::2]))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +58,8 @@ def test_a_static_and_a_moving_recording_give_the_sensor(fit):
 @pytest.mark.thorough
 def test_a_flicker_of_unknown_phase_gives_thresholds_and_bandwidth():
     flicker = Flicker(100.0, 0.8, 20.0)
-    t_us, values = flicker_light(flicker, 0.0, 2e6)
-    events = emulated(constant_frames(np.roll(values, 321), 12, 16), t_us, TRUTH, 3)
+    light, t_us = frames_of(flicker, 0.0, 2e6, 12, 16)
+    events = emulated(np.roll(light, 321, axis=0), t_us, TRUTH, 3)
     fit = fit_sensor(None, 127.5, [KnownLight("flicker", events, flicker)])
     assert fit.estimates["contrast_threshold_on"].value == pytest.approx(0.18, rel=0.06)
     assert fit.estimates["contrast_threshold_off"].value == pytest.approx(0.27, rel=0.06)
@@ -123,6 +116,6 @@ def test_shot_noise_shows_the_refractory_period_in_which_it_pauses():
 
 
 def test_recordings_of_two_sensors_are_refused(static, moving):
-    other = emulated(constant_frames(np.full(3, 200.0), 8, 8), np.arange(3) * 1e6, TRUTH, 3)
+    other = emulated(*frames_of(200.0, 0, 2e6, 8, 8), TRUTH, 3)
     with pytest.raises(ValueError, match="one sensor"):
         fit_sensor(other, 200.0, [moving])

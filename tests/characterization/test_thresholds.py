@@ -78,6 +78,8 @@ def test_thresholds_are_those_without_the_leak():
     on, duration_s = generator.random(n) < 0.5, generator.exponential(0.1, n)
     leaked = 0.3 * 0.3 * duration_s
     increment = np.where(on, 0.3 - leaked, 0.15 + leaked) + 0.006 * generator.standard_normal(n)
-    thresholds = thresholds_without_leak(Increments(increment, duration_s, pixel, on, np.arange(n) // 8), 0.3, 400)
-    assert np.median(thresholds.on.threshold) == pytest.approx(0.3, rel=0.003)
-    assert np.median(thresholds.off.threshold) == pytest.approx(0.15, rel=0.003)
+    on_pixels, off_pixels = thresholds_without_leak(
+        Increments(increment, duration_s, pixel, on, np.arange(n) // 8), 0.3, 400
+    )
+    assert np.median(on_pixels.threshold) == pytest.approx(0.3, rel=0.003)
+    assert np.median(off_pixels.threshold) == pytest.approx(0.15, rel=0.003)

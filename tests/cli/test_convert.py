@@ -54,17 +54,24 @@ def test_what_cannot_be_converted_is_refused(recording, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.txt"]
 
 
-def test_the_part_before_a_reset_of_the_clock_is_converted_as_advised(tmp_path, capsys):
-    times = [*range(5_000_000, 5_400_000, 1000), *range(1000, 400_000, 1000)]
-    (tmp_path / "in.txt").write_text("8 9\n" + "".join(f"{t} 3 4 1\n" for t in times))
-    assert main(["convert", str(tmp_path / "in.txt"), str(tmp_path / "out.h5")]) == 1
-    message = capsys.readouterr().err
+def test_the_parts_before_and_after_resets_of_the_clock_are_converted_as_advised(tmp_path, capsys):
+    parts = range(5_000_000, 5_400_000, 1000), range(1000, 400_000, 1000), range(0, 50_000, 1000)
+    source, out = tmp_path / "in.txt", tmp_path / "out.h5"
+    source.write_text("8 9\n" + "".join(f"{t} 3 4 1\n" for part in parts for t in part))
+
+    def refusal(*options):
+        assert main(["convert", str(source), str(out), *options]) == 1
+        assert not out.exists()
+        message = capsys.readouterr().err
+        return message, [words.split() for words in re.findall(r"OUT ((?:--\w+ \d+us ?)+)`", message)]
+
+    message, (first, rest) = refusal()
     assert "after event 400, time goes back by 5398000 us, from 5399000 to 1000 us, and stays there" in message
-    assert not (tmp_path / "out.h5").exists()
-    advice = re.search(r"--stop \d+us", message)
-    assert advice is not None
-    assert main(["convert", str(tmp_path / "in.txt"), str(tmp_path / "out.h5"), *advice[0].split()]) == 0
-    assert read_recording(tmp_path / "out.h5").events.t.tolist() == [t - 5_000_000 for t in times[:399]]
+    message, (second, third) = refusal(*rest)
+    assert "after event 799, time goes back by 399000 us, from 399000 to 0 us, and stays there" in message
+    for options, part in zip((first, second, third), parts, strict=True):
+        assert main(["convert", str(source), str(out), *options]) == 0
+        assert read_recording(out).events.t.tolist() == [t - part[0] for t in part]
 
 
 def test_events_go_round_through_three_formats_unchanged(tmp_path, capsys):

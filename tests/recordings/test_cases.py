@@ -2,6 +2,7 @@
 
 import pytest
 
+from polarnet.recordings.live import LiveLines
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
 
@@ -9,11 +10,19 @@ VGA = {"height": 480, "width": 640}
 SYNTHETIC = (1164, 199_805, [91, 359, 90], [10, 454, 339], [-1, -1, 1])
 STEREO = (637, 199_911, [50, 326, 220], [5, 98, 52], [1, 1, -1])
 AEDAT4 = (1_600_000_000_000_637, 1_600_000_000_199_911, *STEREO[2:])
+FRAMES = (1_600_000_000_000_000, 1_600_000_000_039_900, [0, 1, 2], [0, 1, 2], [-1, 1, -1])
+CUT = (1_600_000_000_000_050, 1_600_000_000_018_000, [1, 2, 3], [0, 1, 2], [-1, 1, -1])
+LATE = (2_000_000, 3_999_000, *FRAMES[2:])
+GLITCH = (0, 499_750, [30, 32, 48], [30, 26, 17], [-1, -1, -1])
 CASES = {
     "aedat31.aedat": ({}, ("aedat3", 128, 128), 400, (1164, 199_805, [18, 71, 18], [2, 90, 67], [-1, -1, 1])),
     "aedat4_LZ4.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
     "aedat4_NONE.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
     "aedat4_ZSTD.aedat4": ({}, ("aedat4", 260, 346), 300, AEDAT4),
+    "aedat4_frames16.aedat4": ({}, ("aedat4", 26, 34), 400, FRAMES),
+    "aedat4_frames8.aedat4": ({}, ("aedat4", 26, 34), 400, FRAMES),
+    "aedat4_full.aedat4": ({}, ("aedat4", 260, 346), 600, (CUT[0], 1_600_000_000_030_000, *CUT[2:])),
+    "aedat4_cut.aedat4": ({}, ("aedat4", 260, 346), 360, CUT),
     "aedat4_stereo.aedat4": ({"part": "0"}, ("aedat4", 260, 346), 300, AEDAT4),
     "comment_first.txt": ({}, ("text", 480, 640), 400, SYNTHETIC),
     "dsec_blosc.h5": (
@@ -28,20 +37,46 @@ CASES = {
     "evt3_lucid_0x9999.raw": ({}, ("evt", 720, 1280), 2, (1, 1, [3, 5], [5, 5], [-1, 1])),
     "first_time_1e-05.txt": ({}, ("text", 480, 640), 400, (10, 198_651, *SYNTHETIC[2:])),
     "jaer_davis346_x.aedat": ({}, ("aedat2", 260, 346), 2, (100, 200, [10, 10], [20, 20], [1, -1])),
+    **{f"late_run_{n}.txt": ({}, ("text", 260, 346), 2000 - n, LATE) for n in (1, 3, 4, 10)},
     "long_72min.txt": ({}, ("text", 48, 64), 60, (1, 5_900_500_000, [1, 1, 2], [1, 3, 3], [1, 1, -1])),
     "metavision_file_to_csv.csv": (VGA, ("text", 480, 640), 400, SYNTHETIC),
     "metavision_geometry.csv": ({}, ("text", 480, 640), 400, SYNTHETIC),
     "metavision_vlen_geometry.hdf5": ({}, ("metavision", 480, 640), 400, SYNTHETIC),
+    "live_one_wrong_time.txt": ({}, ("text", 480, 640), 399, SYNTHETIC),
+    "live_glitch_20s.txt": ({}, ("text", 48, 64), 1999, GLITCH),
     "mono.bag": ({}, ("rosbag", 260, 346), 300, STEREO),
     "openeb_111_incomplete_vect.raw": ({}, ("evt", 720, 1280), 3, (1, 1_044_480, [0, 10, 1], [0, 0, 0], [-1, -1, -1])),
     "ros2_mono": ({}, ("rosbag", 260, 346), 300, STEREO),
     "ros2_mono/ros2_mono.mcap": ({}, ("rosbag", 260, 346), 300, STEREO),
+    "ros2_event_packet": ({}, ("rosbag", 720, 1280), 0, ([], [], [])),
     "savetxt_us.txt": (VGA, ("text", 480, 640), 60, (1164, 32_901, *SYNTHETIC[2:])),
+    "stale_first_3.txt": ({}, ("text", 48, 64), 400, (1164, 199_805, [9, 35, 9], [1, 45, 33], [-1, -1, 1])),
+    "stereo.bag": ({"part": "/davis/left/events"}, ("rosbag", 260, 346), 300, STEREO),
     "v2e.h5": (VGA, ("e2p", 480, 640), 400, SYNTHETIC),
     "v2e_first_1e-05.txt": (VGA, ("text", 480, 640), 299, (10, 2990, [1, 2, 3], [1, 2, 3], [1, -1, 1])),
 }
 """Arguments; format, height and width; events; times of the first and last event, and the first x, y and p."""
+REPAIRED = {
+    "aedat4_cut.aedat4": {"cut_tail": 1},
+    "long_72min.txt": {"pauses": 59},
+    "openeb_111_incomplete_vect.raw": {"pauses": 1},
+    "live_glitch_20s.txt": {"time_glitches": 1},
+    "live_one_wrong_time.txt": {"time_glitches": 1},
+    **{f"late_run_{n}.txt": {"time_glitches": n} for n in (1, 3, 4, 10)},
+    "stale_first_3.txt": {"stale": 3},
+}
+LIVE = {
+    "comment_first.txt": (400, {}),
+    "late_run_10.txt": (1990, {"time_glitches": 10}),
+    "live_clock_reset.txt": (800, {"clock_resets": 1}),
+    "live_glitch_20s.txt": (1999, {"time_glitches": 1}),
+    "live_one_wrong_time.txt": (399, {"time_glitches": 1}),
+    "stale_first_3.txt": (400, {"stale": 3}),
+}
+"""Events and repairs, read live."""
 REFUSED = {
+    "clock_reset.txt": "time goes back by 198641 us.*--stop 198642us.*--start 208641us",
+    "live_clock_reset.txt": "time goes back by 1000198641 us",
     "aedat4_stereo.aedat4": "--part with one of 0, 1",
     "stereo.bag": "--part with one of /davis/left/events, /davis/right/events",
     "v2e_47_polarity.h5": "events of a polarity that is neither brighter nor darker",
@@ -59,8 +94,18 @@ def cases(shared):
 @pytest.mark.parametrize("name", CASES)
 def test_a_case_has_the_events_that_it_was_written_with(cases, read, name):
     arguments, stated, count, expected = CASES[name]
-    form, (t, *columns), _ = read(cases / name, **arguments)
-    assert (form, len(t), (t[0], t[-1], *(column[:3] for column in columns))) == (stated, count, expected)
+    form, (t, *columns), repairs = read(cases / name, **arguments)
+    assert (form, len(t), repairs) == (stated, count, REPAIRED.get(name, {}))
+    assert (*t[:1], *t[-1:], *(column[:3] for column in columns)) == expected
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", LIVE)
+def test_a_case_goes_on_live(cases, name):
+    with (cases / name).open("rb") as file:
+        live = LiveLines(file, name, ((90, 45), (135, 0)), idle_s=0.0)
+        events = sum(len(channel) for piece in live for channel in piece.channels)
+    assert (events, {kind: count for kind, count in live.counts.items() if count}) == LIVE[name]
 
 
 @pytest.mark.shared
@@ -68,10 +113,3 @@ def test_a_case_has_the_events_that_it_was_written_with(cases, read, name):
 def test_a_case_that_cannot_be_read_as_it_is_says_why(cases, name):
     with pytest.raises(RecordingError, match=REFUSED[name]):
         read_recording(cases / name, **({} if name != "v2e_47_polarity.h5" else VGA))
-
-
-@pytest.mark.shared
-def test_the_cut_case_is_the_start_of_the_whole_one_and_the_packets_hold_no_event(cases, read):
-    (_, whole, _), (_, cut, repairs) = (read(cases / f"aedat4_{name}.aedat4") for name in ("full", "cut"))
-    assert (len(whole[0]), cut, repairs) == (600, [column[:360] for column in whole], {"cut_tail": 1})
-    assert read(cases / "ros2_event_packet") == (("rosbag", 720, 1280), [[]] * 4, {})

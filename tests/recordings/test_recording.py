@@ -1,12 +1,16 @@
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from polarnet.recordings.formats import hdf5, lines, prophesee
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
 from studies.celex5_writer import write_celex5_csv
+from studies.recording_files import FILES
 
 SAMPLES = {
     "aedat4/tonic_sample.aedat4": ("aedat4", 111_954, 240, 320),
@@ -126,3 +130,34 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         open_recording(tmp_path / "e.bag")
     with pytest.raises(RecordingError, match="the file states a height of 12 px, 13 was given"):
         read_recording(tmp_path / "e.txt", height=13, width=18)
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.txt.gz", "a.raw", "a.h5"])
+def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, make_random_events):
+    monkeypatch.setattr(lines, "BLOCK_BYTES", 2000)
+    monkeypatch.setattr(prophesee, "EVT_BLOCK_WORDS", 200)
+    monkeypatch.setattr(hdf5, "BLOCK_EVENTS", 100)
+    write = {".txt": write_text, ".raw": write_evt3, ".h5": write_hdf5}
+    path = tmp_path / name.removesuffix(".gz")
+    write[path.suffix](path, make_random_events(1, 1000, 10**6, 40, 50), 10**6)
+    if name.endswith(".gz"):
+        path = path.rename(tmp_path / "plain")
+        (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
+    reader = open_recording(tmp_path / name, chunk_events=10)
+    shares = [reader.repairs.share_read for _ in reader]
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < 0.5 or name.endswith(".gz")
+    assert 0.8 < shares[-1] <= 1
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FILES if kind != "celex5_bin"])
+def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, make_random_events, same_events):
+    suffix, write = FILES[kind]
+    events = make_random_events(1, 30_000, 10**6, 260, 346)
+    events = replace(events, height=800, width=1280) if kind == "celex5_csv" else events
+    events = replace(events, t=events.t - events.t[0]) if kind == "event_stream" else events  # as faery writes them
+    write(tmp_path / f"e{suffix}", events)
+    part = {"store": "135", "m3ed": "left", "mvsec": "left"}.get(kind)
+    recording = read_recording(tmp_path / f"e{suffix}", part=part)
+    assert (kind.split()[0].rstrip(","), recording.repairs) == (recording.format, {})
+    assert same_events(recording.events, events)

@@ -319,3 +319,36 @@ def test_a_sensor_of_one_row_or_column_is_refused(height, width, tmp_path, monke
     assert main(["recover", "line.zarr", "--write", "zarr"]) == 1
     message = f"expected a sensor of at least 2x2 pixels behind each polarizer, got {height}x{width}"
     assert message in capsys.readouterr().err
+
+
+def test_an_hour_of_live_input_with_a_wrong_clock_loses_the_events_that_the_warning_names(tmp_path, capsys, at_root):
+    """Stale events, late ones, a wrong time, a pause of two minutes, a reset and a jump of two hours; 100 events/s."""
+    minute_us = 60_000_000
+    steady = np.arange(0, 60 * minute_us, 10_000)
+    clock_us = steady + 10**9
+    clock_us[steady >= 20 * minute_us] += 2 * minute_us  # the pause
+    clock_us[steady >= 30 * minute_us] -= 10**9 + 32 * minute_us  # the reset, to 0
+    clock_us[steady >= 45 * minute_us] += 120 * minute_us  # the jump
+    wrong = {10: [10**15], 25: [*range(10**8, 10**8 + 20)], 40: [10**13 + 7]}
+    places = np.repeat([minute * 6000 for minute in wrong], [len(times) for times in wrong.values()])
+    t = np.insert(clock_us, places, np.concatenate([*wrong.values()]))
+    t = np.concatenate([9 * 10**9 + np.arange(40), t])
+    k = np.arange(len(t))
+    table = np.stack([t, k % 8, k // 8 % 8, k // 64 % 2], axis=1)
+    camera, out = tmp_path / "camera.txt", tmp_path / "out"
+    camera.write_bytes(b"8 8\n" + lines_of(table, " "))
+    options = ["--mosaic", "90 45 / 135 0", "--live", "--idle", "0", "--method", "highpass", "--window", "10s"]
+    assert main(["recover", str(camera), *options, "--write", "zarr", "--out", str(out)]) == 0
+    printed, warnings = capsys.readouterr()
+    dropped = {"stale": 40, "time_glitches": sum(map(len, wrong.values()))}
+    named = [int(number.replace(",", "")) for number in re.findall(r"camera\.txt: ([\d,]+) .*left out", warnings)]
+    assert sorted(named) == sorted(dropped.values())
+    counts = re.search(r"events +(.*) degrees", printed)
+    assert counts is not None
+    read = sum(int(number.replace(",", "")) for number in re.findall(r"([\d,]+) at", counts[1]))
+    assert read == len(t) - sum(dropped.values())
+    assert "2 times at which the clock of live input was set anew" in warnings
+    group = zarr.open_group(out / "recovered.zarr", mode="r")
+    last_us = 62 * minute_us - 10_000  # a reset and a jump continue after 10 ms, the step of these events
+    assert group["t_us"][:].tolist() == list(range(10**7, last_us + 1, 10**7))
+    assert np.isfinite(group["dolp"][:]).all()

@@ -12,7 +12,6 @@ A frame has two samples of each pixel, of 10 bits: one after its reset (bits 10 
 """
 
 import re
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from polarnet.recordings.source import (
     Block,
     CameraFrames,
     Choices,
+    Counts,
     RecordingError,
     Source,
     header_lines,
@@ -45,7 +45,7 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
     """Open the events of a DAVIS; times that wrap after 71 minutes are unwrapped."""
     start, height, width = _described(path, choices)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         entries = word_blocks(path, start, ENTRY, BLOCK_EVENTS, counts)
         for t, events in unwrapped(block[block["address"] & NO_EVENT == 0] for block in entries):
             address = events["address"].astype(np.int64)
@@ -64,7 +64,7 @@ def aedat2_frames(path: Path) -> CameraFrames:
     times, frames = [], []
     reset, reset_us = np.full(height * width, -1), np.zeros(height * width, np.int64)
     light, middle_us = np.full(height * width, -1), np.zeros(height * width)
-    for t, block in unwrapped(word_blocks(path, start, ENTRY, BLOCK_EVENTS, Counter())):
+    for t, block in unwrapped(word_blocks(path, start, ENTRY, BLOCK_EVENTS, Counts())):
         address = block["address"].astype(np.int64)
         pixel = (height - 1 - (address >> 22 & 0x1FF)) * width + (address >> 12 & 0x3FF)
         kind = address >> 10 & 3

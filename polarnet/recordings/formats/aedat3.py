@@ -7,7 +7,6 @@ the time are in the packet's header.
 
 import re
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 from polarnet.recordings.source import (
     Block,
     Choices,
+    Counts,
     RecordingError,
     Source,
     chosen_part,
@@ -49,7 +49,7 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
     camera = re.search(rb"\d{3}", names[source])
     size = SENSORS.get(camera[0]) if camera else None
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for overflows, events in _packets(path, len(header), int(source), counts):
             events = events[events["data"] & 1 == 1]
             data, t = events["data"], events["t"] + (np.int64(overflows) << 31)
@@ -58,7 +58,7 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
     return Source(*sensor_size(path, choices, *(size or (None, None))), blocks)
 
 
-def _packets(path: Path, start: int, wanted: int, counts: Counter[str]) -> Iterator[tuple[int, np.ndarray]]:
+def _packets(path: Path, start: int, wanted: int, counts: Counts) -> Iterator[tuple[int, np.ndarray]]:
     """Overflows of the time and events of each packet of a source; a packet that is cut is counted as `cut_tail`."""
     with unpacked(path) as file:
         file.seek(start)

@@ -12,17 +12,17 @@ A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in
 """
 
 import struct
-from collections import Counter
+from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, no_type_check
+from typing import NamedTuple, no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, RecordingError, Source, sensor_size, start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, sensor_size, start_of, unpacked
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
@@ -47,19 +47,8 @@ ROW, COLUMN = 2, 1  # kinds of items
 CSV_COLUMNS = 5
 
 
-class Header(NamedTuple):
-    """The first 12 bytes of a file."""
-
-    data_type: int
-    loop_a: int
-    """Mode of the sensor outside loop mode."""
-    loop_b: int
-    loop_c: int
-    event_format: int
-    hour: int
-    minute: int
-    second: int
-    packages: int
+Header = namedtuple("Header", "data_type loop_a loop_b loop_c event_format hour minute second packages")
+"""The first 12 bytes of a file; loop_a is the sensor's mode outside loop mode."""
 
 
 class Picture(NamedTuple):
@@ -103,7 +92,7 @@ def open_bin(path: Path, choices: Choices) -> Source:
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
         last_adc = np.zeros((HEIGHT, WIDTH), np.uint16)
         for _, package in _packages(path, counts):
@@ -128,7 +117,7 @@ def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
     """The full pictures of a BIN file, in order; RecordingError for other or damaged files."""
-    counts: Counter[str] = Counter()
+    counts = Counts()
     for t_ms, package in _packages(path, counts):
         if package[-1] == 0:
             if len(package) != PICTURE_BYTES:
@@ -161,9 +150,10 @@ def open_csv(path: Path, choices: Choices) -> Source:
         )
     height, width = sensor_size(path, choices, HEIGHT, WIDTH)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
-            row, column, _, p, t = np.ascontiguousarray(rows[rows[:, 3] != 0].T)
+            changed = rows[:, 3] != 0
+            row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
             counts["no_change"] += len(rows) - len(t)
             yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
 
@@ -205,7 +195,7 @@ def _opened(path: Path) -> Header:
     return header
 
 
-def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
+def _packages(path: Path, counts: Counts) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:
     """The computer's time in milliseconds, and the bytes, of each package."""
     header = _opened(path)
     with unpacked(path) as file:
@@ -223,22 +213,15 @@ def _packages(path: Path, counts: Counter[str]) -> Iterator[tuple[int | None, UI
                 counts["cut_tail"] += 1
                 return
             t_ms = None
-            if header.data_type & IMU:
-                t_ms = _skip_imu(path, file)
+            if header.data_type & IMU and len(stamp := file.read(STAMP.size)) == STAMP.size:
+                t_ms, samples = STAMP.unpack(stamp)
+                if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
+                    raise RecordingError(
+                        f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged"
+                    )
+                file.seek(samples * IMU_SAMPLE_BYTES, 1)
             yield t_ms, np.frombuffer(package, np.uint8)
             number += 1
-
-
-def _skip_imu(path: Path, file: BinaryIO) -> int | None:
-    """Skip the time and the IMU's samples; returns the time in milliseconds, or None if the file ends early."""
-    stamp = file.read(STAMP.size)
-    if len(stamp) < STAMP.size:
-        return None
-    t_ms, samples = STAMP.unpack(stamp)
-    if samples * IMU_SAMPLE_BYTES > MAX_PACKAGE or not abs(t_ms) < 2**43:
-        raise RecordingError(f"{path.name}: a package has {samples} IMU samples at {t_ms} ms; the file is damaged")
-    file.seek(samples * IMU_SAMPLE_BYTES, 1)
-    return t_ms
 
 
 @numba.njit(nogil=True, cache=True)

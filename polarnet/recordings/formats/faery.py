@@ -3,38 +3,35 @@
 Its EVT3 decoder holds times back where the sensor's clock steps back, so `prophesee` reads EVT2 and EVT3.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import Block, CameraFrames, Choices, RecordingError, Source, chosen_part, sensor_size
+from polarnet.recordings.source import (
+    Block,
+    CameraFrames,
+    Choices,
+    Counts,
+    RecordingError,
+    Source,
+    chosen_part,
+    sensor_size,
+)
 
 FAERY = Library("faery", "faery", "recordings", "the file is damaged")
 
 
-def open_event_stream(path: Path, choices: Choices) -> Source:
-    """Open the events of Event Stream."""
+def open_faery(path: Path, choices: Choices, *, aedat4: bool) -> Source:
+    """Open Event Stream, or of AEDAT4 the only stream of events or that of the number `part`, with times since 1970.
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for columns in ask(FAERY, path, isolated_worker.event_stream_events):
-            yield Block(*columns)
-
-    size = ask_once(FAERY, path, isolated_worker.event_stream_size)
-    return Source(*sensor_size(path, choices, *size), blocks)
-
-
-def open_aedat4(path: Path, choices: Choices) -> Source:
-    """Open a stream of events of AEDAT4, the only one or that of the number `part`; times are since 1970.
-
-    A file that ends within a packet is read up to there.
+    A file of AEDAT4 that ends within a packet is read up to there.
     """
-    streams = ask_once(FAERY, path, isolated_worker.aedat4_streams)
+    streams = ask_once(FAERY, path, isolated_worker.faery_streams, aedat4)
     stream = chosen_part(path, choices.part, list(streams), "stream of events")
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
-        for columns in ask(FAERY, path, isolated_worker.aedat4_events, stream):
+    def blocks(counts: Counts) -> Iterator[Block]:
+        for columns in ask(FAERY, path, isolated_worker.faery_events, stream):
             if columns is None:
                 counts["cut_tail"] += 1
             else:

@@ -1,7 +1,6 @@
 """HDF5 files in the layouts of `LAYOUTS`: where their columns t (microseconds, or seconds), x, y and p are."""
 
 import re
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from polarnet.recordings.source import (
     Block,
     CameraFrames,
     Choices,
+    Counts,
     RecordingError,
     Source,
     chosen_part,
@@ -109,9 +109,10 @@ def opener(name: str) -> Callable[[Path, Choices], Source]:
             raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
         offset_us = _whole(path, "t_offset", settings.get("t_offset")) or 0
 
-        def blocks(counts: Counter[str]) -> Iterator[Block]:
+        def blocks(counts: Counts) -> Iterator[Block]:
             seconds: bool | None = None
-            for t, x, y, p in _read(path, columns):
+            for number, (t, x, y, p) in enumerate(_read(path, columns)):
+                counts.share_read = min(1.0, number * BLOCK_EVENTS / lengths[0])
                 if seconds is None:
                     seconds = layout.seconds and t.dtype.kind == "f" and not np.equal(t, np.floor(t)).all()
                 t = np.rint(t * 1e6) if seconds else t

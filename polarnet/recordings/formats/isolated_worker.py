@@ -124,33 +124,25 @@ def _plain(value: np.ndarray) -> Any:
     return (value.decode("ascii", "replace") if isinstance(value, bytes) else str(value))[:80]
 
 
-def event_stream_size(path: str) -> Iterator[tuple[int, int]]:
-    """Height and width of the sensor."""
+def faery_streams(path: str, aedat4: bool) -> Iterator[dict[str, tuple[int, int]]]:
+    """Height and width of each stream of events of AEDAT4, or of the one of Event Stream."""
     import faery
 
-    width, height = faery.events_stream_from_file(path, file_type="es").dimensions()
-    yield height, width
+    if aedat4:
+        tracks = [track for track in faery.aedat.Decoder(path).tracks() if track.data_type == "events"]
+        yield {str(track.id): (track.dimensions[1], track.dimensions[0]) for track in tracks}
+    else:
+        yield {"": faery.events_stream_from_file(path, file_type="es").dimensions()[::-1]}
 
 
-def event_stream_events(path: str) -> Iterator[list[np.ndarray]]:
-    """Columns t, x, y and polarity (1 or 0) of the events."""
-    import faery
-
-    yield from _columns(iter(faery.events_stream_from_file(path, file_type="es")))
-
-
-def aedat4_streams(path: str) -> Iterator[dict[str, tuple[int, int]]]:
-    """Height and width of each stream of events."""
-    import faery
-
-    tracks = [track for track in faery.aedat.Decoder(path).tracks() if track.data_type == "events"]
-    yield {str(track.id): (track.dimensions[1], track.dimensions[0]) for track in tracks}
-
-
-def aedat4_events(path: str, stream: str) -> Iterator[list[np.ndarray] | None]:
+def faery_events(path: str, stream: str) -> Iterator[list[np.ndarray] | None]:
     """Columns t, x, y and polarity (1 or 0) of the events of a stream; None at last if the file is cut."""
+    import faery
+
     cut: list[str] = []
-    yield from _columns(packet for track, packet in _aedat4_packets(path, cut) if str(track.id) == stream)
+    packets = (packet for track, packet in _aedat4_packets(path, cut) if str(track.id) == stream)
+    for table in gathered(packets if stream else iter(faery.events_stream_from_file(path, file_type="es"))):
+        yield [table["t"], table["x"], table["y"], table["on"].astype(np.uint8)]
     if cut:
         yield None
 
@@ -176,8 +168,3 @@ def _aedat4_packets(path: str, cut: list[str]) -> Iterator[tuple[Any, Any]]:
         if END_OF_FILE not in str(error):
             raise
         cut.append(str(error))
-
-
-def _columns(tables: Iterator[np.ndarray]) -> Iterator[list[np.ndarray]]:
-    for table in gathered(tables):
-        yield [table["t"], table["x"], table["y"], table["on"].astype(np.uint8)]

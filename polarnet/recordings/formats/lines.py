@@ -6,7 +6,6 @@ tools. Lines that begin with # or % are comments.
 
 import itertools
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, no_type_check
@@ -19,6 +18,7 @@ from polarnet.recordings.source import (
     BLOCK_EVENTS,
     Block,
     Choices,
+    Counts,
     RecordingError,
     Source,
     byte_blocks,
@@ -51,21 +51,9 @@ _KINDS = np.zeros(256, np.uint8)  # of a byte: 0 for a part of a number
 _KINDS[list(b" ,;\t\r\n")], _KINDS[list(b"#%")] = _SEPARATOR_CODE, _COMMENT_CODE
 
 
-class _Layout(NamedTuple):
-    """Facts about a file of lines from its head."""
-
-    order: tuple[str, ...] | None
-    """Names of the columns; None if these are no lines of events."""
-    start: int
-    """Byte offset of the first line that can be an event."""
-    size: Sequence[str]
-    """Width and height, if stated."""
-    columns: int
-
-
 def matches_text(path: Path, head: bytes) -> bool:
     """Whether the first lines name the columns or say `width height`, or are four numbers with a polarity."""
-    return _layout_of(head).order is not None
+    return _layout_of(head)[0] is not None
 
 
 def open_text(path: Path, choices: Choices) -> Source:
@@ -86,14 +74,18 @@ def open_text(path: Path, choices: Choices) -> Source:
     decimals = [0] * len(order)
     decimals[order.index("t")] = MICROSECONDS if _in_seconds(path, start, order.index("t")) else 0
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, tuple(decimals), start, counts):
             yield Block(*(np.ascontiguousarray(rows[:, order.index(name)]) for name in COLUMNS))
 
     return Source(height, width, blocks)
 
 
-def _layout_of(head: bytes) -> _Layout:
+def _layout_of(head: bytes) -> tuple[tuple[str, ...] | None, int, Sequence[str], int]:
+    """Names of the columns (None: no lines of events), offset of the first event, width and height, number of columns.
+
+    Width and height are words of the file, or empty if it does not state them.
+    """
     geometry = _GEOMETRY.search(head)
     size: Sequence[str] = [side.decode() for side in geometry.groups()] if geometry else []
     order, start = _names(head)
@@ -105,7 +97,7 @@ def _layout_of(head: bytes) -> _Layout:
         order = _order_of([line.words for line in lines])
     if order is None and (size or not head.strip()):
         order = COLUMNS
-    return _Layout(order, start, size, len(lines[0].words) if lines else len(COLUMNS))
+    return order, start, size, len(lines[0].words) if lines else len(COLUMNS)
 
 
 def _names(head: bytes) -> tuple[tuple[str, ...] | None, int]:
@@ -148,7 +140,7 @@ def _in_seconds(path: Path, start: int, place: int) -> bool:
 
 
 def number_blocks(
-    path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counter[str]
+    path: Path, decimals: tuple[int, ...], skip_bytes: int, counts: Counts
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
     """Read the lines of a file from byte `skip_bytes` as rows of len(decimals) whole numbers.
 
@@ -201,7 +193,7 @@ def words_of(line: bytes) -> list[bytes]:
 
 
 def rows_of(
-    data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counter[str], damage: str
+    data: bytes, shift: Int64[np.ndarray, " columns"], counts: Counts, damage: str
 ) -> Iterator[Int64[np.ndarray, "n columns"]]:
     """Parse complete lines to rows of numbers, as in `number_blocks`; other lines are counted as `damage`."""
     buffer = np.frombuffer(data, np.uint8)
@@ -236,7 +228,22 @@ def _parse(buffer, start, shift, rows):
             elif kind == _SEPARATOR_CODE:
                 place += 1
             else:
-                value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
+                missing = shift[column] if column < columns else 0
+                value, end, most = 0, place, min(size, place + _DIGITS - 1)  # first the common case: digits
+                while end < most and 48 <= buffer[end] <= 57:
+                    value = 10 * value + buffer[end] - 48
+                    end += 1
+                whole = place < end < most
+                if whole and missing > 0 and buffer[end] == 46:  # ... maybe with a point
+                    end += 1
+                    while end < most and missing > 0 and 48 <= buffer[end] <= 57:
+                        value = 10 * value + buffer[end] - 48
+                        end += 1
+                        missing -= 1
+                if whole and end < most and _KINDS[buffer[end]] and value < _LIMITS[missing]:
+                    value, place = value * _POWERS[missing], end
+                else:
+                    value, place, whole = _number(buffer, place, shift[column] if column < columns else 0)
                 good = good and whole
                 if column < columns:
                     rows[filled, column] = value
@@ -254,19 +261,6 @@ def _parse(buffer, start, shift, rows):
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
-    value, end, most = 0, place, min(size, place + _DIGITS - 1)  # first the common case: digits, maybe with a point
-    while end < most and 48 <= buffer[end] <= 57:
-        value = 10 * value + buffer[end] - 48
-        end += 1
-    missing = shift
-    if start < end < most and shift > 0 and buffer[end] == 46:
-        end += 1
-        while end < most and missing > 0 and 48 <= buffer[end] <= 57:
-            value = 10 * value + buffer[end] - 48
-            end += 1
-            missing -= 1
-    if start < end < most and _KINDS[buffer[end]] and value < _LIMITS[missing]:
-        return value * _POWERS[missing], end, True
     letter = buffer[place] | 32
     if letter == 116 or letter == 102:  # True or False
         while place < size and not _KINDS[buffer[place]]:

@@ -8,7 +8,6 @@ exchanged. As in Prophesee's OpenEB, the header states the order, and where it d
 """
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import no_type_check
@@ -20,6 +19,7 @@ from polarnet.recordings.source import (
     BLOCK_EVENTS,
     Block,
     Choices,
+    Counts,
     RecordingError,
     Source,
     header_lines,
@@ -64,7 +64,7 @@ def open_evt(path: Path, choices: Choices) -> Source:
     height, width = sensor_size(path, choices, *_evt_size(header))
     legacy = version == "2.1" and _is_legacy(header)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         decode = evt_decoder(version, legacy)
         for words in word_blocks(path, len(header), EVT[version][0], EVT_BLOCK_WORDS, counts):
             yield decode(words, counts)
@@ -72,7 +72,7 @@ def open_evt(path: Path, choices: Choices) -> Source:
     return Source(height, width, blocks)
 
 
-def evt_decoder(version: str, legacy: bool = False) -> Callable[[np.ndarray, Counter[str]], Block]:
+def evt_decoder(version: str, legacy: bool = False) -> Callable[[np.ndarray, Counts], Block]:
     """A decoder of consecutive words of an EVT version; it counts events before the first time or row as `orphans`.
 
     `legacy`: the two halves of the words of EVT2.1 are exchanged.
@@ -80,7 +80,7 @@ def evt_decoder(version: str, legacy: bool = False) -> Callable[[np.ndarray, Cou
     _, per_word, decode_words = EVT[version]
     state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
 
-    def decode(words: np.ndarray, counts: Counter[str]) -> Block:
+    def decode(words: np.ndarray, counts: Counts) -> Block:
         if legacy:
             words = words << np.uint64(32) | words >> np.uint64(32)
         columns = [np.empty(per_word * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
@@ -108,7 +108,7 @@ def open_dat(path: Path, choices: Choices) -> Source:
         raise RecordingError(f"{path.name}: expected DAT of version 1 or 2, got {version}")
     height, width = sensor_size(path, choices, stated.get(b"Height"), stated.get(b"Width"))
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         for t, events in unwrapped(word_blocks(path, len(header) + 2, DAT_EVENT, BLOCK_EVENTS, counts)):
             address = events["address"]
             if version == 1:

@@ -7,7 +7,6 @@ Metavision and libcaer write them.
 
 import contextlib
 import struct
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
 from polarnet.recordings.formats.prophesee import evt_decoder
-from polarnet.recordings.source import Block, Choices, RecordingError, Source, chosen_part, sensor_size
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part, sensor_size
 from polarnet.terminal.installation import installation
 
 SUFFIXES = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3": ".db3"}
@@ -52,12 +51,12 @@ def open_rosbag(path: Path, choices: Choices) -> Source:
                 f"(event_camera_msgs), got only {others[:300]}"
             )
         topic = chosen_part(path, choices.part, topics, "topic of events")
-        first = next(_messages(bag, topic), None)
+        first = next(_messages(bag, topic, Counts()), None)
     height, width = sensor_size(path, choices, *((None, None) if first is None else first[:2]))
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         with _opened(path) as bag:
-            messages = _messages(bag, topic)
+            messages = _messages(bag, topic, counts)
             if first is not None and isinstance(first[2], np.ndarray):
                 for table in gathered(events for _, _, events in messages):
                     yield Block(_microseconds(table), table["x"], table["y"], table["p"])
@@ -94,9 +93,12 @@ def _opened(path: Path) -> Iterator[Any]:
         raise RecordingError(f"{path.name}: rosbags cannot read it: {reason}; the bag is damaged") from error
 
 
-def _messages(bag: Any, topic: str) -> Iterator[tuple[int, int, Any]]:
+def _messages(bag: Any, topic: str, counts: Counts) -> Iterator[tuple[int, int, Any]]:
     """Height, width, and the records of an EventArray or the whole EventPacket, of each message."""
-    for connection, _, data in bag.messages([one for one in bag.connections if one.topic == topic]):
+    connections = [one for one in bag.connections if one.topic == topic]
+    total = sum(one.msgcount for one in connections)
+    for number, (connection, _, data) in enumerate(bag.messages(connections)):
+        counts.share_read = min(1.0, number / max(1, total))
         if connection.msgtype in ARRAYS:
             yield _array_of(data, cdr=bag.is2)
         else:
@@ -129,7 +131,7 @@ def _microseconds(events: np.ndarray) -> np.ndarray:
     return events["s"].astype(np.int64) * 1_000_000 + events["ns"] // 1000
 
 
-def _packet_blocks(path: Path, packets: Iterator[Any], counts: Counter[str]) -> Iterator[Block]:
+def _packet_blocks(path: Path, packets: Iterator[Any], counts: Counts) -> Iterator[Block]:
     """Events of consecutive packets of one encoding."""
     encoding, decode = "", None
     for packet in packets:
@@ -142,31 +144,31 @@ def _packet_blocks(path: Path, packets: Iterator[Any], counts: Counter[str]) -> 
         yield decode(packet, counts)
 
 
-def _evt(version: str, word: str) -> Callable[[], Callable[[Any, Counter[str]], Block]]:
+def _evt(version: str, word: str) -> Callable[[], Callable[[Any, Counts], Block]]:
     """A maker of decoders of Prophesee's words, whose time runs on from packet to packet."""
 
-    def make() -> Callable[[Any, Counter[str]], Block]:
+    def make() -> Callable[[Any, Counts], Block]:
         decode = evt_decoder(version)
         return lambda packet, counts: decode(_words(packet, word), counts)
 
     return make
 
 
-def _mono(packet: Any, counts: Counter[str]) -> Block:
+def _mono(packet: Any, counts: Counts) -> Block:
     """Words of 64 bits: nanoseconds since the packet's time base, x, y, polarity."""
     words = _words(packet, "u8")
     t = (packet.time_base + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)) // 1000
     return Block(t, words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63)
 
 
-def _libcaer(packet: Any, counts: Counter[str]) -> Block:
+def _libcaer(packet: Any, counts: Counts) -> Block:
     """Polarity events of libcaer: y and x in the bits of 32, then 31 bits of microseconds since the time base in ns."""
     data, low = _words(packet, "u4").reshape(-1, 2).T
     wraps = np.cumsum(np.diff(low.astype(np.int64), prepend=low[:1]) < 0)
     return Block(packet.time_base // 1000 + low + (wraps << 31), data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1)
 
 
-def _libcaer_compressed(packet: Any, counts: Counter[str]) -> Block:
+def _libcaer_compressed(packet: Any, counts: Counts) -> Block:
     """Words of 16 bits by their upper 4: 0 and 1 microseconds since the base, 2 x, 3 y, 4 base y, 5 a mask of rows."""
     words = _words(packet, "u2").astype(np.int64)
     kind, value, place = words >> 12, words & 0xFFF, np.arange(len(words))
@@ -198,7 +200,7 @@ def _words(packet: Any, kind: str) -> np.ndarray:
     return content[: len(content) // size * size].view(f"{'>' if packet.is_bigendian else '<'}{kind}")
 
 
-PACKETS: dict[str, Callable[[], Callable[[Any, Counter[str]], Block]]] = {
+PACKETS: dict[str, Callable[[], Callable[[Any, Counts], Block]]] = {
     "evt3": _evt("3", "u2"),
     "evt2": _evt("2", "u4"),
     "mono": lambda: _mono,

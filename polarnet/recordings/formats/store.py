@@ -1,10 +1,19 @@
 """Read one channel of one sequence from polarnet's own event store."""
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, RecordingError, Source, chosen_part, sensor_size
+from polarnet.events.stream import Events
+from polarnet.recordings.source import (
+    BLOCK_EVENTS,
+    Block,
+    Choices,
+    Counts,
+    RecordingError,
+    Source,
+    chosen_part,
+    sensor_size,
+)
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 
@@ -30,15 +39,20 @@ def open_store(path: Path, choices: Choices) -> Source:
     channel = ANGLES.index(angle)
     height, width = sensor_size(path, choices, store.height, store.width)
 
-    def blocks(counts: Counter[str]) -> Iterator[Block]:
+    def blocks(counts: Counts) -> Iterator[Block]:
         try:
-            duration_us = store.duration_us(sequence)
-            parts = -(-sum(store.count(sequence)) // BLOCK_EVENTS)
-            edges = [duration_us * k // max(1, parts) for k in range(max(1, parts))]
-            for start, stop in zip(edges, [*edges[1:], duration_us + 1], strict=True):
-                events = store.read(sequence, start, stop)[channel]
-                yield Block(events.t.numpy(), events.x.numpy(), events.y.numpy(), events.p.numpy())
+            total = max(1, store.count(sequence)[channel])
+            for number, events in enumerate(channel_chunks(store, sequence, channel)):
+                counts.share_read = min(1.0, number * BLOCK_EVENTS / total)
+                yield Block(*(getattr(events, name).numpy() for name in "txyp"))
         except ValueError as error:
             raise RecordingError(str(error)) from error
 
     return Source(height, width, blocks)
+
+
+def channel_chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
+    """The events of one channel of a sequence, in chunks."""
+    first, end = store.record(sequence)["offsets"][channel : channel + 2]
+    for start in range(first, end, BLOCK_EVENTS):
+        yield from store.rows(sequence, [(start, min(start + BLOCK_EVENTS, end))])

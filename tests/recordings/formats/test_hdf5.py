@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 from polarnet.recordings.formats.hdf5 import trigger_times_us
-from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.writers import write_hdf5
 
 h5py = pytest.importorskip("h5py")
 
@@ -32,14 +30,6 @@ def write_e2p(path, events, resolution=(346, 260)):
 def write_esfp(path, triggers=None, **columns):
     columns = {"t": [3.0, 9.0], "x": [5, 0], "y": [1, 0], "p": [True, False]} | columns
     return write(path, columns | {"triggers": triggers})
-
-
-def test_dsec_that_polarnet_exports_reads_back_equal(tmp_path, make_random_events, same_events):
-    events = make_random_events(0, 3000, 10**6, 12, 18)
-    write_hdf5(tmp_path / "e.h5", events, 10**6)
-    recording = read_recording(tmp_path / "e.h5")
-    assert recording.format == "dsec"
-    assert same_events(recording.events, events)
 
 
 def test_dsecs_own_files_begin_at_their_offset_and_need_the_size_of_the_sensor(tmp_path, read):

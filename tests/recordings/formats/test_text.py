@@ -6,15 +6,6 @@ import pytest
 
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.writers import write_text
-
-
-def test_text_that_polarnet_exports_reads_back_equal(tmp_path, make_random_events, same_events):
-    events = make_random_events(0, 3000, 10**7, 12, 18)
-    write_text(tmp_path / "e.txt", events, 10**7)
-    recording = read_recording(tmp_path / "e.txt")
-    assert recording.format == "text"
-    assert same_events(recording.events, events)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,172 @@
+"""Write recordings of every format that polarnet reads, for measurements and for tests of damaged files."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polarnet.events.stream import Events, slice_count
+from polarnet.recordings.formats.aedat3 import PACKET
+from polarnet.recordings.formats.hdf5 import LAYOUTS
+from polarnet.recordings.formats.lines import lines_of
+from polarnet.recordings.writers import write_hdf5, write_text
+from polarnet.storage.events import EventStore
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv
+from studies.rosbag_writer import array_bytes, write_arrays, write_packets
+
+PACKET_EVENTS = 10_000
+TEXT_LINES = 1_000_000  # formatted at a time
+
+Writer = Callable[[Path, Events], object]
+
+
+def columns_of(events: Events) -> list[np.ndarray]:
+    """Columns t, x, y, p of 64 bits; p is 1 or 0."""
+    return [column.long().numpy() for column in (events.t, events.x, events.y, events.p > 0)]
+
+
+def parts_of(events: Events, size: int) -> Iterator[list[np.ndarray]]:
+    """The columns in parts of `size` events."""
+    for start in range(0, len(events), size):
+        yield columns_of(slice_count(events, start, start + size))
+
+
+def binary(header: str, content_of: Callable[..., bytes], size: int = TEXT_LINES) -> Writer:
+    """A writer of a header, with {height} and {width}, and of the bytes of the columns, `size` events at a time."""
+
+    def write(path: Path, events: Events) -> None:
+        with path.open("wb") as file:
+            file.write(header.format(height=events.height, width=events.width).encode("latin-1"))
+            file.writelines(itertools.starmap(content_of, parts_of(events, size)))
+
+    return write
+
+
+def evt2(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Words of 32 bits."""
+    words = np.stack([8 << 28 | t >> 6, p << 28 | (t & 63) << 22 | x << 11 | y], axis=1)
+    return words[np.stack([np.diff(t >> 6, prepend=-1) != 0, t >= 0], axis=1)].astype("<u4")
+
+
+def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
+    """Words of 16 bits."""
+    words = np.stack([0x8000 | t >> 12 & 0xFFF, 0x6000 | t & 0xFFF, y, 0x2000 | p << 11 | x], axis=1)
+    new = np.stack([np.diff(t >> 12, prepend=-1) != 0, np.diff(t, prepend=-1) != 0], axis=1)
+    return words[np.hstack([new, np.ones_like(new)])].astype("<u2").tobytes()
+
+
+def aedat3_packet(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
+    """A packet of AEDAT 3.1."""
+    entries = np.stack([x << 17 | y << 2 | p << 1 | 1, t], axis=1).astype("<u4")
+    return PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
+
+
+def table_writer(name: str) -> Writer:
+    """A writer of HDF5 in a layout, with the sensor's size as attributes."""
+    layout, kinds = LAYOUTS[name], ("f8" if LAYOUTS[name].seconds else "i8", "u2", "u2", "u1")
+
+    def write(path: Path, events: Events) -> None:
+        import h5py
+
+        t, x, y, p = columns_of(events)
+        tables: dict[str, dict[Any, np.ndarray]] = {}
+        values = t * 1e-6 if layout.seconds else t, x, y, p
+        for (table, field), column, kind in zip(layout.of(layout.parts[0]), values, kinds, strict=True):
+            tables.setdefault(table, {})[field] = column if isinstance(field, int) else column.astype(kind)
+        with h5py.File(path, "w") as file:
+            file.attrs["height"], file.attrs["width"] = events.height, events.width
+            for table, fields in tables.items():
+                if None in fields:
+                    content = fields[None]
+                elif 0 in fields:
+                    content = np.stack([fields[k] for k in range(len(fields))], axis=1)
+                else:
+                    kinds_of = [(field, column.dtype) for field, column in fields.items()]
+                    content = np.rec.fromarrays([*fields.values()], dtype=kinds_of)
+                file.create_dataset(table, data=content, chunks=True)
+
+    return write
+
+
+def with_faery(path: Path, events: Events) -> None:
+    """AEDAT4 or Event Stream, by the suffix."""
+    import faery
+
+    rows = np.empty(len(events), faery.EVENTS_DTYPE)
+    for name, column in zip(("t", "x", "y", "on"), columns_of(events), strict=True):
+        rows[name] = column
+    faery.events_stream_from_array(rows, (events.width, events.height)).to_file(path)
+
+
+def write_store(path: Path, events: Events) -> None:
+    """An event store; the channels at 0 and 135 degrees hold all events, the others a few and none."""
+    store = EventStore.create(path, ["lake"], events.height, events.width, {})
+    channels = [slice_count(events, 0, count) for count in (len(events), 5, 0, len(events))]
+    store.write("lake", channels, int(events.t[-1]) + 1)
+    store.finish()
+
+
+def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Writer:
+    """A writer of a bag with a message for every `PACKET_EVENTS` events."""
+
+    def write_bag(path: Path, events: Events) -> None:
+        contents = itertools.starmap(content_of, parts_of(events, PACKET_EVENTS))
+        write(path, events.height, events.width, contents)
+
+    return write_bag
+
+
+PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
+AEDAT2 = "#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis{width}blue\r\n#End Of ASCII Header\r\n"
+AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
+FILES: dict[str, tuple[str, Writer]] = {
+    "store": (".zarr", write_store),
+    **{name: (".h5", table_writer(name)) for name in LAYOUTS},
+    "dsec of polarnet": (".h5", lambda path, events: write_hdf5(path, events, None)),
+    "rosbag": (".bag", messages(write_arrays, array_bytes)),
+    "rosbag of EventPacket": ("", messages(write_packets, lambda *columns: ("evt3", 0, evt3(*columns)))),
+    "aedat4": (".aedat4", with_faery),
+    "aedat3": (".aedat", binary(AEDAT3, aedat3_packet, PACKET_EVENTS)),
+    "aedat2": (
+        ".aedat",
+        lambda path, events: binary(
+            AEDAT2,
+            lambda t, x, y, p: (
+                np.stack([events.height - 1 - y << 22 | events.width - 1 - x << 12 | p << 11, t], axis=1)
+                .astype(">u4")
+                .tobytes()
+            ),
+        )(path, events),
+    ),
+    "event_stream": (".es", with_faery),
+    "evt": (".raw", binary(PROPHESEE.format(v="3.0"), evt3)),
+    "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), lambda *columns: evt2(*columns).tobytes())),
+    "evt 2.1": (
+        ".raw",
+        binary(
+            PROPHESEE.format(v="2.1"),
+            lambda *columns: (evt2(*columns).astype("<u8") << np.uint64(32) | np.uint64(1)).tobytes(),
+        ),
+    ),
+    "dat": (
+        ".dat",
+        binary(
+            "% Version 2\n% Height {height}\n% Width {width}\n\x0c\x08",
+            lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes(),
+        ),
+    ),
+    "text": (".txt", lambda path, events: write_text(path, events, None)),
+    "text of microseconds": (
+        ".txt",
+        binary("{width} {height}\n", lambda *columns: lines_of(np.stack(columns, axis=1), " ")),
+    ),
+    "text, CSV of Prophesee": (
+        ".csv",
+        binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
+    ),
+    "celex5_csv": (".csv", write_celex5_csv),
+    "celex5_bin": (".bin", write_celex5_bin),
+}
+"""Suffix and writer of each format, and of further kinds of files whose first word is the format."""

@@ -1,0 +1,214 @@
+"""Speed and memory of recordings: python -m studies.recordings [--write] [--sections NAME ...] [--formats NAME ...]
+
+Sections of docs/results/recordings.json, each measured in processes of their own:
+
+- `readers`: M events per CPU second of every reader and of `polarnet inspect`, on 10 M random events, 1 M a second, of
+  a 1280 x 720 sensor where the format has no other (10 k events a packet or message). The CPU time is that of the
+  process and its children, the shortest of three runs, with the file in the disk cache. Writers: the same from memory.
+- `bytes`: memory of `read_recording` for each event more, between 8 and 32 M events.
+- `memory`: peak of `inspect`, `convert` and `recover --method highpass` on 2, 8 and 32 M events of a 346 x 260 sensor.
+- `cases`: tests of the reference cases, with POLARNET_SHARED.
+"""
+
+import argparse
+import functools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import psutil
+import torch
+
+from polarnet.cli import main as polarnet
+from polarnet.events.stream import Events, concatenate
+from polarnet.recordings.recording import open_recording, read_recording
+from polarnet.recordings.writers import FORMS
+from studies.recording_files import FILES
+from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, read_results, write_section
+
+COUNT, SMALL = 10_000_000, 20_000  # events; the small file compiles every kernel
+PART = 1_000_000  # events that are made at a time, and microseconds that they take
+REPEATS = 3
+SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_csv": (800, 1280), "celex5_bin": (800, 1280)}
+SENSOR = 720, 1280  # of the other formats
+PARTS = {"store": "0", "m3ed": "left", "mvsec": "left"}
+MEMORY_SIZES = (2_000_000, 8_000_000, 32_000_000)
+MEMORY_SENSOR = 260, 346
+MEMORY_FORMS = ("evt3", "hdf5", "text")
+COMMANDS: dict[str, list[str]] = {
+    "inspect": ["--out", "OUT"],
+    "convert": ["OUT"],
+    "recover": ["--method", "highpass", "--mosaic", "90 45 / 135 0", "--write", "zarr", "--out", "OUT"],
+}
+MIB = 2**20
+SECTIONS = ("readers", "memory", "cases")
+
+
+def parts(count: int, height: int, width: int) -> Iterator[Events]:
+    """The same random events again and again, later each time."""
+    generator = torch.Generator().manual_seed(0)
+    size = min(count, PART)
+    t = torch.randint(PART, (size,), generator=generator).sort().values
+    x, y, p = (torch.randint(limit, (size,), generator=generator) for limit in (width, height, 2))
+    for start in range(0, count, PART):
+        yield Events(t + start, x.short(), y.short(), (2 * p - 1).to(torch.int8), height, width)
+
+
+def cpu_s() -> float:
+    """CPU seconds of this process and its children."""
+    own = psutil.Process()
+    times = [one.cpu_times() for one in (own, *own.children(recursive=True))]
+    return sum(one.user + one.system for one in times) + own.cpu_times().children_user
+
+
+def shortest_cpu_s(run: Callable[[], object]) -> float:
+    """CPU seconds of the fastest of three runs."""
+    seconds = []
+    for _ in range(REPEATS):
+        start = cpu_s()
+        run()
+        seconds.append(cpu_s() - start)
+    return min(seconds)
+
+
+def speed_of_reader(kind: str) -> dict[str, float]:
+    """M events per CPU second of `open_recording` and of `polarnet inspect`."""
+    suffix, write = FILES[kind]
+    sensor, part = SENSORS.get(kind, SENSOR), PARTS.get(kind)
+    with tempfile.TemporaryDirectory() as folder:
+        large, small = Path(folder, f"large{suffix}"), Path(folder, f"small{suffix}")
+        write(large, concatenate(list(parts(COUNT, *sensor))))
+        write(small, concatenate(list(parts(SMALL, *sensor))))
+
+        def read(path: Path) -> int:
+            return sum(map(len, open_recording(path, part=part)))
+
+        def inspect(path: Path) -> None:
+            if polarnet(["inspect", str(path), "--out", folder, *(["--part", part] if part else [])]):
+                raise RuntimeError(f"{kind}: polarnet inspect failed")
+
+        read(small)
+        inspect(small)
+        count = read(large)
+        if count < 0.99 * COUNT:  # a CeleX-5 has no polarity where the intensity stays
+            raise RuntimeError(f"{kind}: expected {COUNT} events, read {count}")
+        seconds = {"read": shortest_cpu_s(lambda: read(large)), "inspect": shortest_cpu_s(lambda: inspect(large))}
+    return {key: round(count / one / 1e6, 2) for key, one in seconds.items()}
+
+
+def speed_of_writer(form: str) -> float:
+    """M events per CPU second of a writer."""
+    suffix, write = FORMS[form]
+    events = concatenate(list(parts(COUNT, *SENSOR)))
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder, f"small{suffix}"), parts(SMALL, *SENSOR), None)
+        return round(COUNT / shortest_cpu_s(lambda: write(Path(folder, f"large{suffix}"), events, None)) / 1e6, 2)
+
+
+def peak_mib() -> float:
+    """Peak memory in MiB of this process and its children."""
+    own = psutil.Process()
+    marks = [Path(f"/proc/{process.pid}/status").read_text() for process in (own, *own.children(recursive=True))]
+    return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024
+
+
+def peak_of_command(command: str, path: str) -> float:
+    """Peak memory in MiB of a command of polarnet on a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = [word.replace("OUT", f"{folder}/out.h5") for word in COMMANDS[command]]
+        if polarnet([command, path, *words]):
+            raise RuntimeError(f"polarnet {command} {path} failed")
+    return round(peak_mib(), 1)
+
+
+def peak_of_array(path: str) -> float:
+    """Peak memory in MiB of `read_recording`."""
+    read_recording(path)
+    return round(peak_mib(), 1)
+
+
+def measure_readers(formats: Collection[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Speed of the readers and writers of these formats, beside the known ones."""
+    files, writers = known.get("files", {}), known.get("writers", {})
+    for name in (name for name in FILES if name in formats):
+        files[name] = in_own_process("studies.recordings", "--one", "reader", name)
+        print(name, files[name], flush=True)
+    for form in (form for form in FORMS if form in formats):
+        writers[form] = in_own_process("studies.recordings", "--one", "writer", form)
+        print(form, writers[form], flush=True)
+    return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
+
+
+def measure_memory(forms: Iterable[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Peak memory of the commands, and bytes an event of an array, beside the known ones of other formats."""
+    rows, arrays = known.get("commands", {}), known.get("bytes_per_event", {})
+    for form in forms:
+        peaks: dict[int, dict[str, float]] = {}
+        for size in MEMORY_SIZES:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, f"recording{FORMS[form][0]}")
+                FORMS[form][1](path, parts(size, *MEMORY_SENSOR), None)
+                peaks[size] = {
+                    name: in_own_process("studies.recordings", "--one", name, path) for name in (*COMMANDS, "array")
+                }
+            print(form, size, peaks[size], flush=True)
+        for name in COMMANDS:
+            rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
+        few, many = MEMORY_SIZES[1:]
+        arrays[form] = round((peaks[many]["array"] - peaks[few]["array"]) * MIB / (many - few), 2)
+    return {"commands": rows, "bytes_per_event": arrays}, {"bytes_per_event_max": max(arrays.values())}
+
+
+def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Tests of the reference cases."""
+    if "POLARNET_SHARED" not in os.environ:
+        raise SystemExit("--sections cases: set POLARNET_SHARED to the folder with cases/recordings")
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        command = [sys.executable, "-m", "pytest", "-q", "tests/recordings/test_cases.py", f"--junitxml={report}"]
+        subprocess.run(command, cwd=ROOT, check=False)
+        cases = ElementTree.parse(report).getroot().iter("testcase")
+        right = {str(case.get("name")): len(case) == 0 for case in cases}
+    return {"right": right}, {"cases_right": sum(right.values()), "cases_total": len(right)}
+
+
+ONE: dict[str, Callable[[str], Any]] = {
+    "reader": speed_of_reader,
+    "writer": speed_of_writer,
+    "array": peak_of_array,
+    **{name: functools.partial(peak_of_command, name) for name in COMMANDS},
+}
+
+
+def main() -> None:
+    """The command line."""
+    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser.add_argument("--sections", nargs="*", choices=SECTIONS, default=SECTIONS)
+    everything = list(dict.fromkeys([*FILES, *FORMS]))
+    parser.add_argument("--formats", nargs="*", choices=everything, default=everything)
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    arguments = arguments_of(parser)
+    if arguments.one:
+        task, about = arguments.one
+        print(json.dumps(ONE[task](about)))
+        return
+    for section in arguments.sections:
+        record, known = machine_record(), read_results(ROOT, "recordings").get(section, {})
+        if section == "readers":
+            figures, headlines = measure_readers(arguments.formats, known)
+        elif section == "memory":
+            figures, headlines = measure_memory([name for name in MEMORY_FORMS if name in arguments.formats], known)
+        else:
+            figures, headlines = measure_cases()
+        if arguments.write:
+            write_section("recordings", section, figures, record, headlines)
+
+
+if __name__ == "__main__":
+    main()
