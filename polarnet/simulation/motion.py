@@ -62,7 +62,9 @@ class Pose(NamedTuple):
 
     x: Float64[np.ndarray, "*n"]  # scene column under the sensor's centre
     y: Float64[np.ndarray, "*n"]  # scene row
-    angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled clockwise: picture and AoLP turn the other way
+    angle: Float64[
+        np.ndarray, "*n"
+    ]  # radians by which the camera is rolled clockwise: picture and AoLP turn the other way
     zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1
 
 
@@ -289,7 +291,8 @@ def render(
     """(S0, S1, S2) on the moving sensor at times `t_s` in seconds, interpolated bilinearly from those of the scene.
 
     Pixel centres are at integers in sensor and scene. The camera measures angles from its own axes: rolled clockwise by
-    an angle a, it sees a scene whose picture and AoLP are turned by a anticlockwise. Its pixels are `pitch` scene pixels apart: 2 for the cells of a DoFP sensor.
+    an angle a, it sees a scene whose picture and AoLP are turned by a anticlockwise. Its pixels are `pitch` scene
+    pixels apart: 2 for the cells of a DoFP sensor.
     """
     pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
     return torch.from_numpy(render_poses(scene, pose._replace(zoom=pose.zoom / pitch), height, width))

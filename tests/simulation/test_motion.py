@@ -169,7 +169,9 @@ def test_a_bar_at_30_degrees_polarized_along_itself_stays_so_while_the_camera_ro
     """Angles count anticlockwise; the camera rolls clockwise, so that it sees both turned by as much."""
     y, x = torch.meshgrid(torch.arange(61.0) - 30, torch.arange(81.0) - 40, indexing="ij")
     across = x * math.sin(math.radians(30)) + y * math.cos(math.radians(30))
-    bar = scene_from_polarization(torch.exp(-(across**2) / 20), torch.full_like(x, 0.75), torch.full_like(x, math.pi / 6))
+    bar = scene_from_polarization(
+        torch.exp(-(across**2) / 20), torch.full_like(x, 0.75), torch.full_like(x, math.pi / 6)
+    )
     frame = render(bar, still(40.0, 30.0, roll=math.radians(roll_deg)), np.zeros(1), 41, 41)[0].double()
     y, x = y[10:51, 20:61], x[10:51, 20:61]
     weight = frame[0] * (x**2 + y**2 <= 400)

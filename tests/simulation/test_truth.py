@@ -41,7 +41,7 @@ def images(tmp_path_factory) -> Path:
         coarse.resize((120, 80), Image.Resampling.BICUBIC).save(root / "pictures" / f"{i}.png")
     config = IngestConfig(
         source="folder", root=str(root / "pictures"), limit=None, dead_leaves=0, height=80, width=120, max_upscale=2.0,
-        val_fraction=0.2, test_fraction=0.2, mosaic="90 45 / 135 0", residual_max=0.1,
+        val_fraction=0.2, test_fraction=0.2, mosaic="90 45 / 135 0", white=None, residual_max=0.1,
     )  # fmt: skip
     logging.disable(logging.WARNING)
     ingest(config, 1, root / "images", map)
