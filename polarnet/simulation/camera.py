@@ -63,6 +63,11 @@ class PolarizersConfig(RandomisedConfig):
         spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
         return self.layout == "four_sensors" and not spread
 
+    @property
+    def max_crosstalk(self) -> float:
+        """Largest crosstalk that a sequence may draw."""
+        return max(self.crosstalk, *map(float, (self.randomise or {}).get("crosstalk", [0.0])))
+
 
 IDEAL = PolarizersConfig(
     layout="four_sensors", mosaic="90 45 / 135 0", extinction_ratio=[None] * NUM_CHANNELS,

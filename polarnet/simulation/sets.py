@@ -119,8 +119,8 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     if not (images / "manifest.json").exists():
         fill(images)
     if not (scenes.exists() and frames.exists()):
-        layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
-        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, layout=layout)
+        size, polarizers = recipe.sequences_per_part, recipe.camera.polarizers
+        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, polarizers=polarizers)
         synthesize(synthesis, scenes, frames, mapper("synthesize"))
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
