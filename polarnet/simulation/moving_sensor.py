@@ -69,8 +69,7 @@ def leave_sensors(channels: list[Events], camera: Camera, duration_us: int) -> l
     if camera.polarizers.layout == "dofp":
         mosaic = parse_mosaic(camera.polarizers.mosaic)
         return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us)[0], mosaic)
-    keys = [(key + number) % 2**64 for number in range(len(channels))]
-    return [read_out(channel, readout, k, duration_us)[0] for channel, k in zip(channels, keys, strict=True)]
+    return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
 
 
 def emulate_motion_steps(

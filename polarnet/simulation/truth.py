@@ -136,7 +136,7 @@ def _create(
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
     config, variation, per_part = synthesis.motion, synthesis.variation, synthesis.sequences_per_part
     files = [(entry.file.encode(), b"\0", bytes.fromhex(sha256(synthesis.images / entry.file))) for entry in entries]
-    attributes = {
+    attributes: dict[str, Any] = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
         "layout": synthesis.polarizers.layout,
