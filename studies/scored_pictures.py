@@ -76,7 +76,7 @@ def part_of(images: Path, folder: Path, split: str, limit: int | None) -> Path:
 def scenes_of(images: Path, config: Config) -> SceneStore:
     """Scenes and motions of the pictures, made beside them if missing."""
     size, polarizers = config.storage.sequences_per_part, config.polarizers
-    sections = map(dataclasses.asdict, (config.synthesize, polarizers))
+    sections = dataclasses.asdict(config.synthesize), dataclasses.asdict(polarizers)
     made_with = json.dumps([*sections, config.seed]).encode()
     folder = images.with_name(f"{images.name}_{sha256(made_with)[:12]}")
     if not (folder / "frames.zarr").exists():
