@@ -1,5 +1,7 @@
 """Polarization optics: Stokes vectors, DoLP, AoLP and the intensity behind a polarizer (paper Eq. 1-4).
 
+Angles of polarizers and of polarization count anticlockwise from the right, in an image whose first row is the top.
+
 Functions take numpy arrays or torch tensors and return tensors. They raise TypeError for anything but an array of real
 numbers, and ValueError for other axes or for integers, whose differences wrap around. All values are allowed,
 including NaN.
@@ -95,13 +97,14 @@ def intensities_from_stokes(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "
 
 
 def dolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:
-    """Degree of linear polarization (paper Eq. 2); 0 without light.
+    """Degree of linear polarization (paper Eq. 2); 0 without light, NaN where a Stokes parameter is NaN.
 
     Not clamped: intensities reconstructed from events can be unphysical, with a DoLP above 1.
     """
     s0, s1, s2 = _planes("stokes", stokes, "... 3 height width").unbind(-3)
-    lit = s0 > 0
-    return torch.where(lit, torch.hypot(s1, s2) / torch.where(lit, s0, 1.0), 0.0)
+    polarized = torch.hypot(s1, s2)
+    dark = (s0 <= 0) & ~polarized.isnan()
+    return torch.where(dark, 0.0, polarized / torch.where(dark, 1.0, s0))
 
 
 def aolp(stokes: Float[Array, "*b 3 h w"]) -> Float[Tensor, "*b h w"]:

@@ -9,8 +9,8 @@ from polarnet.simulation.truth import Synthesis, synthesize
 @hydra_stage
 def main(config: Config) -> None:
     """Make a scene from every picture and move the sensor over it."""
-    size, layout = config.storage.sequences_per_part, config.polarizers.layout
-    synthesis = Synthesis(Path(config.paths.images), config.synthesize, config.seed, size, config.variation, layout)
+    images, size = Path(config.paths.images), config.storage.sequences_per_part
+    synthesis = Synthesis(images, config.synthesize, config.seed, size, config.variation, config.polarizers)
     count = synthesize(synthesis, config.paths.scenes, config.paths.frames, config.mapper("synthesize"))
     print(f"{count} sequences")
 

@@ -75,12 +75,13 @@ def part_of(images: Path, folder: Path, split: str, limit: int | None) -> Path:
 
 def scenes_of(images: Path, config: Config) -> SceneStore:
     """Scenes and motions of the pictures, made beside them if missing."""
-    size, layout = config.storage.sequences_per_part, config.polarizers.layout
-    made_with = json.dumps([dataclasses.asdict(config.synthesize), layout, config.seed]).encode()
+    size, polarizers = config.storage.sequences_per_part, config.polarizers
+    sections = dataclasses.asdict(config.synthesize), dataclasses.asdict(polarizers)
+    made_with = json.dumps([*sections, config.seed]).encode()
     folder = images.with_name(f"{images.name}_{sha256(made_with)[:12]}")
     if not (folder / "frames.zarr").exists():
         folder.mkdir(exist_ok=True)
-        synthesis = Synthesis(images, config.synthesize, config.seed, size, layout=layout)
+        synthesis = Synthesis(images, config.synthesize, config.seed, size, polarizers=polarizers)
         synthesize(synthesis, folder / "scenes.zarr", folder / "frames.zarr", config.mapper("scenes"))
     return SceneStore.open(folder / "scenes.zarr")
 

@@ -45,6 +45,11 @@ def test_no_light_has_no_polarization_and_unphysical_intensities_are_not_hidden(
     assert dolp(pixel(1, 3, 0)).item() == 3
 
 
+@pytest.mark.parametrize("stokes", [(math.nan, 0, 0), (1, math.nan, 0), (0, 0, math.nan), (math.nan,) * 3])
+def test_dolp_of_nan_is_nan(stokes):
+    assert dolp(pixel(*stokes)).isnan().all()
+
+
 def test_eq_4_as_printed_equals_the_stokes_form():
     s0, degree, angle = 0.8, 0.3, math.radians(20)
     stokes = stokes_from_polarization(*(torch.full((1, 1), v, dtype=torch.float64) for v in (s0, degree, angle)))

@@ -35,9 +35,11 @@ def sequence_at(scenes: SceneStore, name: str, events: Sequence[Events], t_us: I
     stored = scenes.read(name)
     scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
     trajectory = Trajectory.from_vector(scenes.trajectory(name))
-    size = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
-    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *size))
-    valid = None if stored.valid is None else valid_frames(stored.valid, trajectory, t_us.tolist()[1:], *size)
+    pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *pixels))
+    valid, crosstalk = stored.valid, scenes.attributes.get("crosstalk", 0.0)
+    if valid is not None:
+        valid = valid_frames(valid, trajectory, t_us.tolist()[1:], pixels, crosstalk)
     s0 = intensity[:, 0] + intensity[:, 2]
     return TestSequence(name, scenes.scene_of[name], events, t_us, dolp, aolp, s0, valid)
 

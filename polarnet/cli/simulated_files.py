@@ -17,7 +17,7 @@ from polarnet.events.stream import Events
 from polarnet.recordings.writers import FORMS
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import write_true_video
-from polarnet.simulation.camera import Camera
+from polarnet.simulation.camera import Camera, pixel_analyzers
 from polarnet.simulation.moving_sensor import leave_sensors
 from polarnet.storage.events import MAX_DURATION_US, EventStore
 from polarnet.storage.frames import CONVENTIONS, FRAMES_PER_CHUNK, quantise
@@ -28,6 +28,7 @@ from polarnet.terminal.progress import ProgressBar
 STORE = "store"
 FORMATS = (STORE, *FORMS)
 EVENTS, TRUTH, VIDEO, PICTURE, SPOOL = "events.zarr", APPENDED, "preview.mp4", "preview.png", "spool"
+ANALYZER = "analyzer.npy"
 TRUTH_CONVENTIONS = {**CONVENTIONS, "s0": "S0 = I0 + I90: value / 65535"}
 COLUMNS: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
 
@@ -129,7 +130,10 @@ def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndar
 
 def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, output: Output) -> list[str]:
     """Files of the events: one for each sensor of the camera in formats of cameras, and all channels in the store."""
-    files, polarizers = [], camera.polarizers
+    polarizers, files = camera.polarizers, [ANALYZER]
+    pitch = 2 if polarizers.layout == "dofp" else 1
+    analyzer = pixel_analyzers(camera, pitch * channels[0].height, pitch * channels[0].width)
+    np.save(output.folder / ANALYZER, analyzer.numpy())
     sensors = {f"polarizer_{a:03d}": one for a, one in zip(stokes.POLARIZER_ANGLES_DEG, channels, strict=True)}
     if polarizers.layout == "dofp" and set(output.formats) - {STORE}:
         sensors = {"sensor": join_mosaic(channels, stokes.parse_mosaic(polarizers.mosaic))}
@@ -137,7 +141,7 @@ def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, 
         if form == STORE:
             size = channels[0].height, channels[0].width
             store = EventStore.create(output.folder / EVENTS, [output.name], *size, output.attributes)
-            store.write(output.name, channels, duration_us)
+            store.write(output.name, channels, duration_us, analyzer=analyzer)
             store.finish()
             files.append(EVENTS)
             continue

@@ -64,10 +64,10 @@ class Clip:
 def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
     """Open a video, a folder of frames, four videos behind polarizers, or the picture of a single frame.
 
-    A folder whose files are all NAME_0, NAME_45, NAME_90, NAME_135 or .npz holds measured polarization; with a
-    `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the numbers in their names.
-    FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong together, on iterating
-    for later frames.
+    A folder whose files are all NAME_0, NAME_45, NAME_90, NAME_135 or .npz holds measured polarization, unless its
+    numbers count frames; with a `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the
+    numbers in their names. FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong
+    together, on iterating for later frames.
     """
     missing = [str(path) for path in paths if not path.exists()]
     if missing:
@@ -106,11 +106,9 @@ def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
     files = sorted((path for path in visible if extension(path) in kinds), key=_in_order)
     if not files:
         raise UnreadablePicture(f"{folder}: expected the pictures of a clip, found none; videos are given as files")
-    measured = all(extension(file) == "npz" or ANGLE_SUFFIX.fullmatch(file.stem) for file in files)
-    grouped = options.mosaic is None and measured
-    return _open_files(
-        polarimetry.group_by_measurement(files) if grouped else [(file,) for file in files], name, options
-    )
+    groups = polarimetry.group_by_measurement(files)
+    grouped = options.mosaic is None and polarimetry.are_measurements(groups)
+    return _open_files(groups if grouped else [(file,) for file in files], name, options)
 
 
 def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
@@ -118,8 +116,8 @@ def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOpti
     if not measured and options.mosaic is None:
         kind = "photograph" if len(groups) == 1 else "frames"
         return _coloured(name, kind, _from_files(groups, _rgb), options)
-    kind = "four polarizers" if measured else "raw mosaics"
-    return _measured(name, kind, _from_files(groups, polarimetry.read_levels), options)
+    kind, read = ("four polarizers", polarimetry.read_levels) if measured else ("raw mosaics", polarimetry.read_raw)
+    return _measured(name, kind, _from_files(groups, read), options)
 
 
 def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, ...]], Levels]) -> _Files:
@@ -222,12 +220,10 @@ def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Cli
     def frames() -> Iterator[ClipFrame]:
         white = options.white
         for number, (levels, t_us) in enumerate(_of_one_size(files)):
-            white = polarimetry.white_level(levels) if white is None else white
-            if levels.max() > white:
-                raise UnreadablePicture(
-                    f"frame {number}: expected levels up to {white:g}, those of the first frame's bits, got "
-                    f"{levels.max():g}; give --white, the level at which the camera saturates"
-                )
+            try:
+                white = polarimetry.white_level(levels, white)
+            except UnreadablePicture as error:
+                raise UnreadablePicture(f"frame {number}: {error}") from None
             height, width = levels.shape[1:]
             if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
                 raise UnreadablePicture(

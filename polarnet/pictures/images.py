@@ -93,9 +93,9 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     )
 
 
-def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
-    """The upright code values of all channels except alpha; raises as `read_picture` does."""
-    pixels, spec, _ = _read(Path(path))
+def read_channels(path: str | os.PathLike[str], as_stored: bool = False) -> Shaped[np.ndarray, "h w c"]:
+    """The upright code values of all channels except alpha, or `as_stored`; raises as `read_picture` does."""
+    pixels, spec, _ = _read(Path(path), as_stored)
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
 
@@ -200,7 +200,7 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
     return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
 
 
-def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
+def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
     kind = extension(path)
     if kind in CAMERA_RAW:
@@ -211,9 +211,9 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
         str(path).encode("utf-8")
     except UnicodeEncodeError:
         raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it") from None
-    as_stored = oiio.ImageSpec()
-    as_stored["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
-    file = oiio.ImageInput.open(str(path), as_stored)
+    unmultiplied = oiio.ImageSpec()
+    unmultiplied["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
+    file = oiio.ImageInput.open(str(path), unmultiplied)
     if file is None:
         raise UnreadablePicture(f"cannot be read: {_first_line(oiio.geterror(), path)}")
     try:
@@ -226,7 +226,8 @@ def _read(path: Path) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
         file.close()
     if pixels is None or problem:
         raise UnreadablePicture(f"cannot be read: {_first_line(problem, path)}")
-    return upright(_plain(pixels), spec.get_int_attribute("Orientation", 1)), spec, file.format_name()
+    orientation = 1 if as_stored else spec.get_int_attribute("Orientation", 1)
+    return upright(_plain(pixels), orientation), spec, file.format_name()
 
 
 def _names_profile(png: Path) -> bool:

@@ -55,6 +55,8 @@ class IngestConfig:
     mosaic: str
     """Polarizer angles of the 2x2 pixels of a raw mosaic, even row / odd row (source=polarization). A colour sensor's
     order of colours, such as RGGB, stands before them."""
+    white: PositiveFloat | None
+    """Level at which a measurement's camera saturates (source=polarization); null: found from the bits in use."""
     residual_max: PositiveFloat
     """Largest accepted median of |I0 + I90 - I45 - I135| / S0 (source=polarization)."""
 
@@ -214,7 +216,7 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
     number, source = item
     try:
-        measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic))
+        measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic), config.white)
         if measured.residual > config.residual_max:
             raise UnreadablePicture(
                 f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, above "

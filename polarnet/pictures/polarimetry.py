@@ -13,11 +13,12 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
-from polarnet.pictures.images import UnreadablePicture, read_channels
+from polarnet.pictures.images import UnreadablePicture, extension, read_channels
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 
-ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0*(?P<angle>0|45|90|135)")
-WHITE_LEVELS = (2**10 - 1, 2**12 - 1, 2**14 - 1, 2**16 - 1)  # possible saturation levels in 16-bit files
+ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0{0,2}(?P<angle>0|45|90|135)")
+NUMBERED = re.compile(r"(?P<name>.+)_\d+")
+WIDTHS = (10, 12, 14, 16)  # bits of a value of a camera in a 16-bit file
 STEPS = 2**16 - 1  # code value of an intensity of 1 in the files written here
 COLOURS = ("RGGB", "BGGR", "GRBG", "GBRG")  # order of the four 2x2 blocks in a colour sensor's 4x4 (Sony IMX250MYR)
 MIN_MOSAIC_SIDE = 6  # pixels; demosaicking leaves out the cells on the rim
@@ -35,12 +36,39 @@ class Measurement:
 
 
 def group_by_measurement(files: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Group the files NAME_0, NAME_45, NAME_90, NAME_135 of a folder; every other file is a group of its own."""
+    """Group the files NAME_0, NAME_45, NAME_90, NAME_135 of a folder; every other file is a group of its own.
+
+    NAME_1 or another number beside them shows that the numbers count frames: then each file is a group of its own.
+    """
     groups: dict[Path, list[Path]] = {}
     for file in files:
-        match = ANGLE_SUFFIX.fullmatch(file.stem) if file.suffix.lower() != ".npz" else None
+        match = NUMBERED.fullmatch(file.stem) if extension(file) != "npz" else None
         groups.setdefault(file.with_name(match["name"]) if match else file, []).append(file)
-    return [tuple(sorted(group)) for group in groups.values()]
+    return [
+        part
+        for group in groups.values()
+        for part in ([tuple(sorted(group))] if all(map(_names_angle, group)) else [(file,) for file in group])
+    ]
+
+
+def are_measurements(groups: Sequence[tuple[Path, ...]]) -> bool:
+    """Whether all groups of a folder's files are measurements with a file per angle, complete or not, or .npz files.
+
+    Files that only name an angle, such as A_0 and B_0, are none.
+    """
+    certain = [len(group) > 1 or extension(group[0]) == "npz" for group in groups]
+    return any(certain) and all(sure or _names_angle(group[0]) for sure, group in zip(certain, groups, strict=True))
+
+
+def _names_angle(file: Path) -> bool:
+    return ANGLE_SUFFIX.fullmatch(file.stem) is not None
+
+
+def _counts_frames(file: Path) -> bool:
+    """Whether a number that is no angle lies beside NAME_0."""
+    numbered = [beside for beside in file.parent.iterdir() if NUMBERED.fullmatch(beside.stem)]
+    name = file.stem.rpartition("_")[0]
+    return any(beside.stem.rpartition("_")[0] == name and not _names_angle(beside) for beside in numbered)
 
 
 def parse_raw_mosaic(order: str) -> tuple[Mosaic, str | None]:
@@ -49,14 +77,18 @@ def parse_raw_mosaic(order: str) -> tuple[Mosaic, str | None]:
     return (parse_mosaic(angles), colours) if colours in COLOURS else (parse_mosaic(order), None)
 
 
-def read_measurement(files: Sequence[Path], mosaic: Mosaic, colours: str | None = None) -> Measurement:
+def read_measurement(
+    files: Sequence[Path], mosaic: Mosaic, colours: str | None = None, white: float | None = None
+) -> Measurement:
     """Read a measurement from four pictures, one .npz with I0, I45, I90, I135, or one raw mosaic (`parse_raw_mosaic`).
 
-    One saturated angle of a pixel is computed from the others, I0 + I90 = I45 + I135; pixels with more are not valid.
-    UnreadablePicture if files are missing, damaged, or do not belong together.
+    Pixels stay as they are stored: an EXIF orientation would turn the scene, but not the angles of the polarizers.
+    `white` is the level of saturation; None: `white_level`. One saturated angle of a pixel is computed from the others,
+    I0 + I90 = I45 + I135; pixels with more are not valid.
+    UnreadablePicture if files are missing, damaged, brighter than `white`, or do not belong together.
     """
     levels = read_levels(files)
-    values, saturated = levels_at_angles(levels, white_level(levels), mosaic, colours)
+    values, saturated = levels_at_angles(levels, white_level(levels, white), mosaic, colours)
     i0, i45, i90, i135 = values
     total, count = values.sum(axis=0) / 2, saturated.sum(axis=0)
     trusted = (count == 0) & (total > 0)
@@ -69,9 +101,10 @@ def read_measurement(files: Sequence[Path], mosaic: Mosaic, colours: str | None 
 
 def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
     """Code values in a group of files: four angles (n = 4), or a raw mosaic (n = 1); raises as `read_measurement`."""
-    if paths[0].suffix.lower() == ".npz":
+    if extension(paths[0]) == "npz":
         return _read_npz(paths[0])
-    return _read_angles(paths) if ANGLE_SUFFIX.fullmatch(paths[0].stem) else _read_raw(paths[0])
+    raw = len(paths) == 1 and (not _names_angle(paths[0]) or _counts_frames(paths[0]))
+    return read_raw(paths) if raw else _read_angles(paths)
 
 
 def levels_at_angles(
@@ -156,15 +189,28 @@ def read_intensities(path: str | os.PathLike[str]) -> tuple[Float32[Tensor, "4 h
         return torch.from_numpy(steps.astype(np.float32) / STEPS), torch.from_numpy(file["valid"])
 
 
-def white_level(values: Shaped[np.ndarray, "n h w"]) -> float:
-    """Level at which values saturate; UnreadablePicture unless they have 8 or 16 bits or are floats in [0, 1].
+def white_level(values: Shaped[np.ndarray, "n h w"], stated: float | None = None) -> float:
+    """Level at which values saturate: `stated`, or found in values of 8 or 16 bits or floats in [0, 1].
 
-    In 16-bit files, it is that of the lowest of 10, 12, 14 and 16 bits that hold all values.
+    In 16-bit files it is the lowest top of 10, 12, 14 or 16 bits that holds all values. Low bits that are 0 in all
+    values do not count, so that 12 bits at the upper end of 16 saturate at 65520. UnreadablePicture for values above
+    `stated` or of other types.
     """
+    if stated is not None:
+        if values.max() > stated:
+            raise UnreadablePicture(
+                f"expected levels up to {stated:g}, got {values.max():g}; state the level at which the camera "
+                f"saturates, with ingest.white or --white"
+            )
+        return stated
     if values.dtype == np.uint8:
         return 255.0
     if values.dtype == np.uint16:
-        return float(min(white for white in WHITE_LEVELS if white >= values.max()))
+        used = int(np.bitwise_or.reduce(values, axis=None))
+        spare = max(0, (used & -used).bit_length() - 1)  # bits below the lowest in use
+        pairs = [(width, width - bits) for width in WIDTHS for bits in WIDTHS] + [(16, 8)]
+        tops = [2**width - 2**low for width, low in pairs if 0 <= low <= spare]
+        return float(min(top for top in tops if top >= values.max()))
     if np.issubdtype(values.dtype, np.floating):
         if not (values.min() >= 0 and values.max() <= 1):  # false for NaN too
             raise UnreadablePicture(f"expected floats in [0, 1], got {values.min():g} to {values.max():g}")
@@ -193,13 +239,15 @@ def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
     missing = [angle for angle in POLARIZER_ANGLES_DEG if angle not in by_angle]
     if missing:
         raise UnreadablePicture(f"no file for {', '.join(f'_{angle}' for angle in missing)} beside {files[0].name}")
-    pictures = [read_channels(by_angle[angle]) for angle in POLARIZER_ANGLES_DEG]
+    pictures = [read_channels(by_angle[angle], as_stored=True) for angle in POLARIZER_ANGLES_DEG]
     planes = [picture[..., 1 if picture.shape[2] >= 3 else 0] for picture in pictures]
     return _stacked(planes, [by_angle[angle].name for angle in POLARIZER_ANGLES_DEG])
 
 
-def _read_raw(path: Path) -> Shaped[np.ndarray, "1 h w"]:
-    pixels = read_channels(path)
+def read_raw(paths: Sequence[Path]) -> Shaped[np.ndarray, "1 h w"]:
+    """Code values of the one file of a raw mosaic; raises as `read_measurement`."""
+    (path,) = paths
+    pixels = read_channels(path, as_stored=True)
     if pixels.shape[2] != 1:
         raise UnreadablePicture(
             f"{pixels.shape[2]} channels: neither a raw mosaic nor one of NAME_0, NAME_45, NAME_90, NAME_135"

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from polarnet.pictures.builtin import BUILTIN_PHOTOS as BUILTIN_PHOTOS
     from polarnet.pictures.images import read_rgb as read_rgb
     from polarnet.simulation.camera import Camera as Camera
+    from polarnet.simulation.camera import pixel_analyzers as pixel_analyzers
     from polarnet.simulation.emulator import EmulatorConfig as EmulatorConfig
     from polarnet.simulation.emulator import SensorState as SensorState
     from polarnet.simulation.emulator import emulate as emulate

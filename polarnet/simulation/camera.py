@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64
 from pydantic import Field, NonNegativeFloat, PositiveFloat
+from torch import Tensor
 
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, select
@@ -41,13 +42,17 @@ class PolarizersConfig(RandomisedConfig):
     """Transmission along the axis over that across it; null: infinite."""
     angle_error_deg: FourValues[Annotated[float, Field(ge=-90, le=90)]]
     transmission: FourValues[Annotated[float, Field(gt=0, le=1)]]
-    """Transmission of light polarized along the axis."""
+    """Transmission of light polarized along the axis, 1 at most."""
     extinction_spread: NonNegativeFloat
-    """Standard deviation between pixels of the natural logarithm of the extinction ratio."""
+    """Standard deviation between pixels of the natural logarithm of the extinction ratio, which is 1 at least.
+
+    An infinite ratio (null) has no spread."""
     angle_spread_deg: NonNegativeFloat
     """Standard deviation of the angle between pixels."""
     transmission_spread: NonNegativeFloat
-    """Relative standard deviation of the transmission between pixels."""
+    """Relative standard deviation of the transmission between pixels, before it is clipped to [0, 1].
+
+    With transmission 1, half of the pixels keep 1, and the mean falls to 1 - 0.4 x the spread: 0.988 at 0.03."""
     crosstalk: Annotated[float, Field(ge=0, le=MAX_CROSSTALK)]
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
@@ -62,6 +67,11 @@ class PolarizersConfig(RandomisedConfig):
         """Whether each channel has a sensor of its own, all of whose pixels see through the same polarizer."""
         spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
         return self.layout == "four_sensors" and not spread
+
+    @property
+    def max_crosstalk(self) -> float:
+        """Largest crosstalk that a sequence may draw."""
+        return max(self.crosstalk, *map(float, (self.randomise or {}).get("crosstalk", [0.0])))
 
 
 IDEAL = PolarizersConfig(
@@ -105,7 +115,7 @@ class Camera:
     sensor: EmulatorConfig
     polarizers: PolarizersConfig = IDEAL
     readout: ReadoutConfig = PERFECT
-    key: int = 0  # 64 bits that seed mismatch and noise: two cameras of one kind differ in it. `drawn` sets it.
+    key: int = 0  # modulo 2^64, seeds mismatch and noise: two cameras of one kind differ in it. `drawn` sets it.
 
     @property
     def sections(self) -> dict[str, Any]:
@@ -154,7 +164,7 @@ def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
 def weights_of(
     polarizers: PolarizersConfig, height: int, width: int, key: int
 ) -> Float32[np.ndarray, "sensors 3 *pixels"]:
-    """Weights of S0, S1 and S2 at each sensor, for each pixel if pixels differ, as `key` (64 bits) seeds."""
+    """Weights of S0, S1 and S2 at each sensor, for each pixel if pixels differ, as `key` (modulo 2^64) seeds."""
     channels = np.arange(NUM_CHANNELS)
     if polarizers.layout == "dofp":
         grid(polarizers.layout, height, width)
@@ -166,7 +176,8 @@ def weights_of(
     def spread(purpose: int, deviation: float) -> Float64[np.ndarray, "*pixels"]:
         if deviation == 0:
             return np.zeros(channels.shape)
-        maps = [randomness.normal_map(np.uint64(key), purpose, i, channels[i].size) for i in range(len(channels))]
+        seed = np.uint64(key % 2**64)
+        maps = [randomness.normal_map(seed, purpose, i, channels[i].size) for i in range(len(channels))]
         return deviation * np.stack(maps).reshape(channels.shape).astype(np.float64)
 
     angles = np.radians(np.add(POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))[channels]
@@ -176,6 +187,26 @@ def weights_of(
     ratios = np.array([math.inf if ratio is None else ratio for ratio in polarizers.extinction_ratio])[channels]
     ratios = np.maximum(ratios * np.exp(spread(randomness.EXTINCTION, polarizers.extinction_spread)), 1)
     return analyzer(angles, ratios, along).swapaxes(0, 1).astype(np.float32)
+
+
+def pixel_analyzers(camera: Camera, height: int, width: int) -> Float32[Tensor, "4 3 *pixels"]:
+    """Analyzer of each pixel of the four channels of a camera whose sensors have this size.
+
+    The light behind a pixel is a0 S0 + a1 S1 + a2 S2, so its polarizer has the angle atan2(a2, a1) / 2, and transmits
+    a0 + hypot(a1, a2) along and a0 - hypot(a1, a2) across its axis. Crosstalk is included: then the sum holds where the
+    pixel and its four neighbours see the same light. Shape (4, 3) if all pixels of a channel are alike, else
+    (4, 3, rows, columns).
+
+    >>> from polarnet.simulation import POLARIZERS, SENSORS, Camera, pixel_analyzers
+    >>> pixel_analyzers(Camera(SENSORS["default"], POLARIZERS["micropolarizers"], key=1), 120, 180).shape
+    torch.Size([4, 3, 60, 90])
+    """
+    weights, polarizers = weights_of(camera.polarizers, height, width, camera.key), camera.polarizers
+    if polarizers.layout == "dofp":
+        weights = split_cells(mixed_with_neighbours(weights[0], polarizers.crosstalk), polarizers.mosaic)
+    pixels = weights.reshape(NUM_CHANNELS, 3, -1)
+    alike = (pixels == pixels[..., :1]).all()
+    return torch.from_numpy(pixels[..., 0].copy() if alike else weights)
 
 
 def mixed_with_neighbours(frames: Float32[np.ndarray, "n h w"], crosstalk: float) -> Float32[np.ndarray, "n h w"]:
@@ -195,7 +226,7 @@ def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np
 def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
     """The events of one sensor as they leave it, in time order, and the number of events lost on the bus.
 
-    `key` (64 bits) seeds the jitter. Events that would leave after `duration_us` are missing.
+    `key` (modulo 2^64) seeds the jitter. Events that would leave after `duration_us` are missing.
     """
     if config.perfect or len(events) == 0:
         return events, 0
@@ -203,7 +234,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
     t, y = events.t.numpy(), events.y.numpy()
     times_us = t + config.row_latency_us * y
     if config.jitter_us:
-        jitter = randomness.normal_map(np.uint64(key), randomness.TIMESTAMP, 0, len(t))
+        jitter = randomness.normal_map(np.uint64(key % 2**64), randomness.TIMESTAMP, 0, len(t))
         times_us = times_us + config.jitter_us * jitter.astype(np.float64)
     order = np.lexsort((y, t, np.rint(times_us))) if config.jitter_us or config.row_latency_us else np.arange(len(t))
     times_us, rows = np.maximum(times_us[order], 0), y[order].astype(np.int64)

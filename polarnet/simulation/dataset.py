@@ -5,8 +5,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from polarnet.events.stream import Events, slice_time
-from polarnet.simulation.camera import Camera, channel_size
+from polarnet.simulation.camera import Camera, channel_size, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
@@ -31,19 +33,19 @@ def emulate_scenes(
     store = EventStore.create(
         events, source.sequences, *size, origin_of(source, camera, seed), source.sequences_per_part
     )
-    emulated = functools.partial(emulate_sequence, source, camera=camera, seed=seed, threads=threads)
+    emulated = functools.partial(_emulated, source, camera, seed, threads)
     return fill_store(store, source, emulated, camera, seed, mapper)
 
 
 def fill_store(
     store: EventStore,
     scenes: SceneStore,
-    emulated: Callable[[str], list[Events]],
+    emulated: Callable[[str], tuple[list[Events], Tensor | None]],
     camera: Camera,
     seed: int,
     mapper: Mapper,
 ) -> int:
-    """Write what `emulated` returns for each sequence that is missing in a store; returns the number of sequences."""
+    """Write the events and analyzers of each sequence that is missing in a store; returns the number of sequences."""
     task = functools.partial(_fill_part, scenes=scenes, events=store, emulated=emulated, camera=camera, seed=seed)
     for _ in mapper(task, store.missing_parts()):
         pass
@@ -55,17 +57,25 @@ def _fill_part(
     part: str,
     scenes: SceneStore,
     events: EventStore,
-    emulated: Callable[[str], list[Events]],
+    emulated: Callable[[str], tuple[list[Events], Tensor | None]],
     camera: Camera,
     seed: int,
 ) -> None:
     for sequence in events.parts[part]:
-        events.write(sequence, emulated(sequence), scenes.duration_us(sequence), camera.draws(seed, sequence))
+        channels, analyzer = emulated(sequence)
+        events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence), analyzer)
 
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     """All settings and data that determine the events of a scene store; its checksum stands for its pixels."""
     return {**camera.sections, "seed": seed, "scenes": scenes.attributes, "scenes_sha256": scenes.header["checksum"]}
+
+
+def _emulated(
+    scenes: SceneStore, camera: Camera, seed: int, threads: int, sequence: str
+) -> tuple[list[Events], Tensor | None]:
+    analyzer = pixel_analyzers(camera.drawn(seed, sequence), scenes.sensor_height, scenes.sensor_width)
+    return emulate_sequence(scenes, sequence, camera, seed, threads), analyzer
 
 
 def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:

@@ -104,7 +104,7 @@ class Channels(NamedTuple):
     height: int
     width: int
     sensor: EmulatorConfig
-    key: int  # 64 bits that seed all noise; each channel draws its mismatch and noise by its number
+    key: int  # modulo 2^64, seeds all noise; each channel draws its mismatch and noise by its number
 
 
 def emulate(
@@ -120,10 +120,10 @@ def emulate(
 
     Frames are uint8, or float in digital numbers 0..255. Without a state, the pixels adapt to the first frame, which
     fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
-    clip. `key` (64 bits) seeds all noise, which each channel draws by its number in `channels` (default: 0, 1, ...).
-    Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels. TypeError
-    for anything but an array; ValueError for times that do not increase, values that are not finite or outside
-    0..255, and sizes that do not fit.
+    clip. `key`, modulo 2^64, seeds all noise, which each channel draws by its number in `channels` (default: 0, 1,
+    ...). Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels.
+    TypeError for anything but an array; ValueError for times that do not increase, values that are not finite or
+    outside 0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -172,7 +172,7 @@ def emulate_lights(
     forget_stale_code()
     numbers, height, width, config, key = channels
     model = MODELS[config.model]
-    physics, seed = model.physics_of(config), np.uint64(key)
+    physics, seed = model.physics_of(config), np.uint64(key % 2**64)
     times = t_us if state is None else np.concatenate([[state.t_us], t_us])
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))

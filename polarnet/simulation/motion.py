@@ -62,7 +62,9 @@ class Pose(NamedTuple):
 
     x: Float64[np.ndarray, "*n"]  # scene column under the sensor's centre
     y: Float64[np.ndarray, "*n"]  # scene row
-    angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled, from the x axis towards the y axis (down)
+    angle: Float64[
+        np.ndarray, "*n"
+    ]  # radians by which the camera is rolled clockwise: picture and AoLP turn the other way
     zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1
 
 
@@ -288,8 +290,9 @@ def render(
 ) -> Float32[Tensor, "n 3 h w"]:
     """(S0, S1, S2) on the moving sensor at times `t_s` in seconds, interpolated bilinearly from those of the scene.
 
-    Pixel centres are at integers in sensor and scene. The camera measures angles from its own axes: rolled by an angle
-    a, it sees the scene's AoLP minus a. Its pixels are `pitch` scene pixels apart: 2 for the cells of a DoFP sensor.
+    Pixel centres are at integers in sensor and scene. The camera measures angles from its own axes: rolled clockwise by
+    an angle a, it sees a scene whose picture and AoLP are turned by a anticlockwise. Its pixels are `pitch` scene
+    pixels apart: 2 for the cells of a DoFP sensor.
     """
     pose = trajectory.pose(np.asarray(t_s, dtype=np.float64))
     return torch.from_numpy(render_poses(scene, pose._replace(zoom=pose.zoom / pitch), height, width))
@@ -339,5 +342,5 @@ def _render(stokes, x, y, angle, zoom, frames):
                 at_y = top + column * across + row * along
                 s1, s2 = _bilinear(stokes[1], at_x, at_y), _bilinear(stokes[2], at_x, at_y)
                 frames[k, 0, row, column] = _bilinear(stokes[0], at_x, at_y)
-                frames[k, 1, row, column] = s1 * cos + s2 * sin
-                frames[k, 2, row, column] = s2 * cos - s1 * sin
+                frames[k, 1, row, column] = s1 * cos - s2 * sin
+                frames[k, 2, row, column] = s2 * cos + s1 * sin

@@ -90,7 +90,7 @@ def emulate_rotating_scenes(
 
 def _emulate_stored(
     scenes: SceneStore, rotating: RotatingConfig, camera: Camera, seed: int, pixels: Grid, sequence: str
-) -> list[Events]:
+) -> tuple[list[Events], None]:
     drawn = camera.drawn(seed, sequence, "rotating")
     output = emulate_rotating(rotating, drawn, *motion_over(scenes, sequence), pixels)
-    return [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)]
+    return [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)], None

@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor, tensor
 
 from polarnet.events.stream import Events
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for
-from polarnet.simulation.camera import Camera, grid
+from polarnet.simulation.camera import Camera, grid, pixel_analyzers
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -40,6 +40,9 @@ class Simulation(NamedTuple):
     trajectory: Trajectory
     camera: Camera
     """The camera, with the values that it drew where its parameters have ranges (`randomise`)."""
+    analyzer: Float32[Tensor, "4 3 *pixels"]
+    """Weights of S0, S1 and S2 in the light behind the four polarizers, of each pixel if pixels differ
+    (`pixel_analyzers`)."""
 
 
 def simulate(
@@ -80,4 +83,5 @@ def simulate(
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)
     events = emulate_motion(camera, scene, trajectory, t_us[-1], size)
     pixels = grid(camera.polarizers.layout, *size)
-    return Simulation(events, tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), trajectory, camera)
+    frames = frames_of(scene, trajectory, t_us, *pixels)
+    return Simulation(events, tensor(t_us), *frames, trajectory, camera, pixel_analyzers(camera, *size))

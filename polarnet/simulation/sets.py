@@ -15,7 +15,7 @@ from typing import Any
 from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
-from polarnet.pictures.polarimetry import group_by_measurement
+from polarnet.pictures.polarimetry import are_measurements, group_by_measurement
 from polarnet.runtime.files import changed_files, code_digest, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
@@ -82,14 +82,13 @@ def make_folder_set(
 
 
 def kind_of(root: Path) -> str:
-    """`polarization` if a folder holds .npz files or pictures NAME_0, NAME_45, NAME_90, NAME_135, else `photographs`.
+    """`polarization` if a folder holds only .npz files or NAME_0, NAME_45, NAME_90, NAME_135, else `photographs`.
 
     Raw mosaics look like photographs: name their kind.
     """
     kinds = picture_extensions() | {"npz"}
     files = [path for path in files_under(root) if path.is_file() and extension(path) in kinds]
-    measured = any(len(group) == 4 or extension(group[0]) == "npz" for group in group_by_measurement(files))
-    return "polarization" if measured else "photographs"
+    return "polarization" if are_measurements(group_by_measurement(files)) else "photographs"
 
 
 def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path], Any], source: str) -> bool:
@@ -120,8 +119,8 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     if not (images / "manifest.json").exists():
         fill(images)
     if not (scenes.exists() and frames.exists()):
-        layout, size = recipe.camera.polarizers.layout, recipe.sequences_per_part
-        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, layout=layout)
+        size, polarizers = recipe.sequences_per_part, recipe.camera.polarizers
+        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, polarizers=polarizers)
         synthesize(synthesis, scenes, frames, mapper("synthesize"))
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)

@@ -20,7 +20,7 @@ from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation import scene as scene_module
-from polarnet.simulation.camera import IDEAL, channel_size, grid
+from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, channel_size, grid, mixed_with_neighbours
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.variation import VariationConfig, varied
@@ -54,14 +54,20 @@ def frames_of(
 
 
 def valid_frames(
-    valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], height: int, width: int, pitch: int = 1
+    valid: Bool[Tensor, "h1 w1"], trajectory: Trajectory, t_us: Sequence[int], pixels: Grid, crosstalk: float = 0.0
 ) -> Bool[Tensor, "n h w"]:
-    """Sensor pixels with known light: those interpolated from valid pixels of the scene only.
+    """Pixels of the channels with known light: those whose events and truth come from valid scene pixels only.
 
-    Interpolation weights are not negative, so the rendered mask of invalid pixels is 0 exactly there.
+    All four pixels of a DoFP sensor's cell count, and with `crosstalk` their neighbours. Interpolation weights are not
+    negative, so the rendered mask of invalid pixels is 0 exactly there.
     """
-    scene = PolarizationScene((~valid).float().expand(3, -1, -1))
-    return render(scene, trajectory, np.asarray(t_us) * 1e-6, height, width, pitch)[:, 0] == 0
+    scene, t_s = PolarizationScene((~valid).float().expand(3, -1, -1)), np.asarray(t_us) * 1e-6
+    unknown = render(scene, trajectory, t_s, *pixels)[:, 0]
+    if pixels.pitch > 1:
+        sensor = render(scene, trajectory, t_s, pixels.height * pixels.pitch, pixels.width * pixels.pitch)[:, 0]
+        mixed = torch.from_numpy(mixed_with_neighbours(sensor.numpy(), crosstalk))
+        unknown = unknown + torch.nn.functional.max_pool2d(mixed, pixels.pitch)
+    return unknown == 0
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ class Synthesis:
     seed: int
     sequences_per_part: int
     variation: VariationConfig | None = None  # variants of training pictures; None: no variants
-    layout: str = IDEAL.layout  # section `polarizers`: the frames are those of the channels of such a camera
+    polarizers: PolarizersConfig = IDEAL  # the frames are those of the channels of such a camera
 
 
 def synthesize(
@@ -130,10 +136,10 @@ def _create(
     """Two unfinished stores; their attributes record all inputs, so that only an equal run resumes them."""
     config, variation, per_part = synthesis.motion, synthesis.variation, synthesis.sequences_per_part
     files = [(entry.file.encode(), b"\0", bytes.fromhex(sha256(synthesis.images / entry.file))) for entry in entries]
-    attributes = {
+    attributes: dict[str, Any] = {
         "synthesize": asdict(config),
         "variation": asdict(variation) if variation else None,
-        "layout": synthesis.layout,
+        "layout": synthesis.polarizers.layout,
         "seed": synthesis.seed,
         "images_sha256": sha256(*itertools.chain.from_iterable(files)),
     }
@@ -141,6 +147,8 @@ def _create(
     splits = {motion.sequence: motion.split for motion in motions}
     variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
+    if masked and (crosstalk := synthesis.polarizers.max_crosstalk):
+        attributes["crosstalk"] = crosstalk
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
     largest = max(entry.height for entry in entries), max(entry.width for entry in entries)
@@ -149,7 +157,7 @@ def _create(
         scenes, contents, scene_of, largest_picture=largest, sensor=sensor, trajectory_names=names
     )
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
-    size = channel_size(synthesis.layout, *sensor)
+    size = channel_size(synthesis.polarizers.layout, *sensor)
     frame_store = FrameStore.create(frames, contents, len(frame_times_us(config)), *size)
     return scene_store, frame_store
 
@@ -157,8 +165,8 @@ def _create(
 @one_thread()
 def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesis, motions: Sequence[Motion]) -> None:
     """Write the part of both stores that holds the sequences of these motions."""
-    config = synthesis.motion
-    t_us, pixels = frame_times_us(config), grid(synthesis.layout, config.sensor_height, config.sensor_width)
+    config, polarizers, valid = synthesis.motion, synthesis.polarizers, None
+    t_us, pixels = frame_times_us(config), grid(polarizers.layout, config.sensor_height, config.sensor_width)
     for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
         planes = _planes_of(name, picture, synthesis)
         if not scenes.masked:
@@ -166,7 +174,8 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
         scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
         for sequence, *_, trajectory in over_scene:
             scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
-            valid = None if planes.valid is None else valid_frames(planes.valid, trajectory, t_us, *pixels)
+            if planes.valid is not None:
+                valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.max_crosstalk)
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 

@@ -11,10 +11,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from torch import Tensor
 
+from polarnet.stokes import intensities_from_stokes
+
 MAX_STEP_PX = 1.0
+CONTRAST_SIDE = 15  # pixels of the square over which contrast is averaged
+FAINT = 1.0  # squared slope, in steps of 8 bits, that every intensity counts for where nothing has contrast
 FLOW_QUANTILE = 0.999  # quantile of the flow's length taken as the motion: pixels without texture get arbitrary flow
 
 
@@ -37,10 +41,7 @@ def upsampled(frames: Iterable[StokesFrame]) -> Iterator[StokesFrame]:
 
 
 def _between(before: StokesFrame, after: StokesFrame, dis: cv2.DISOpticalFlow) -> Iterator[StokesFrame]:
-    first_grey, last_grey = _grey(before.stokes[0], after.stokes[0])
-    start = np.zeros((*first_grey.shape, 2), np.float32)
-    forward, backward = dis.calc(first_grey, last_grey, start.copy()), dis.calc(last_grey, first_grey, start.copy())
-    moved = float(np.quantile(np.hypot(*np.moveaxis(forward, -1, 0)), FLOW_QUANTILE))
+    forward, backward, moved = _flows(before, after, dis)
     steps = max(1, min(math.ceil(moved / MAX_STEP_PX), after.t_us - before.t_us))
     first, last = (np.ascontiguousarray(frame.stokes.numpy().transpose(1, 2, 0)) for frame in (before, after))
     for k in range(1, steps):
@@ -53,10 +54,25 @@ def _between(before: StokesFrame, after: StokesFrame, dis: cv2.DISOpticalFlow) -
         yield StokesFrame(t_us, torch.from_numpy(np.ascontiguousarray(blend.transpose(2, 0, 1))))
 
 
-def _grey(before: Float32[Tensor, "h w"], after: Float32[Tensor, "h w"]) -> list[UInt8[np.ndarray, "h w"]]:
-    """S0 of both frames in 8 bits, the brightest pixel white."""
-    white = max(float(before.max()), float(after.max())) or 1.0
-    return [np.rint(s0.numpy() * (255 / white)).astype(np.uint8) for s0 in (before, after)]
+def _flows(
+    before: StokesFrame, after: StokesFrame, dis: cv2.DISOpticalFlow
+) -> tuple[Float32[np.ndarray, "h w 2"], Float32[np.ndarray, "h w 2"], float]:
+    """Flow from one frame to the other and back, and the largest motion behind the four polarizers, in pixels.
+
+    A place moves as the four intensities do on average, each weighted by its contrast there: texture may be in DoLP or
+    AoLP alone, and then S0 shows no motion.
+    """
+    light = [intensities_from_stokes(frame.stokes).clamp(min=0).numpy() for frame in (before, after)]
+    white = max(float(one.max()) for one in light) or 1.0
+    flows, weights = [], []
+    for first, last in zip(*(np.rint(one * (255 / white)).astype(np.uint8) for one in light), strict=True):
+        start, slopes = np.zeros((*first.shape, 2), np.float32), np.stack(cv2.spatialGradient(first)).astype(np.float32)
+        flows.append((dis.calc(first, last, start.copy()), dis.calc(last, first, start.copy())))
+        weights.append(cv2.blur(np.square(slopes).sum(axis=0), (CONTRAST_SIDE, CONTRAST_SIDE)) + np.float32(FAINT))
+    moved = max(float(np.quantile(np.hypot(*np.moveaxis(forward, -1, 0)), FLOW_QUANTILE)) for forward, _ in flows)
+    shares = (weights / np.sum(weights, axis=0))[:, None, ..., None]
+    forward, backward = (shares * np.array(flows)).sum(axis=0)
+    return forward, backward, moved
 
 
 def _warped(frame: Float32[np.ndarray, "h w 3"], flow: Float32[np.ndarray, "h w 2"]) -> Float32[np.ndarray, "h w 3"]:

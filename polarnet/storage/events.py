@@ -8,10 +8,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 from pydantic import Field, PositiveInt
+from torch import Tensor
 
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
-from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG
+from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer
 from polarnet.storage.groups import REPAIR
 from polarnet.storage.parts import Header, Store
 
@@ -21,6 +23,10 @@ CHUNK = (
 )  # events compressed together; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 INDEX_STEP = 2**14  # events
 COLUMNS = {"t": "uint32", "x": "uint16", "y": "uint16", "p": "int8"}
+
+ANALYZER = "analyzer"
+IDEAL_ANALYZER = torch.from_numpy(analyzer(np.radians(POLARIZER_ANGLES_DEG)).T.astype(np.float32))
+"""That of simulated sequences for which none is stored."""
 
 CONVENTIONS = {
     "layout": "a sequence's channels one after the other, from offsets[c] up to offsets[c + 1] of its rows",
@@ -74,13 +80,22 @@ class EventStore(Store):
         )
 
     def write(
-        self, sequence: str, channels: Sequence[Events], duration_us: int, drawn: Mapping[str, Any] | None = None
+        self,
+        sequence: str,
+        channels: Sequence[Events],
+        duration_us: int,
+        drawn: Mapping[str, Any] | None = None,
+        analyzer: Float32[Tensor, "4 3 *pixels"] | None = None,
     ) -> None:
         """Write the four channels (0, 45, 90, 135 degrees) of the next sequence of a part; see `Store.append`.
 
-        `drawn` (plain JSON) are the camera parameters drawn for this sequence. ValueError, before anything is
-        written, for events out of order, off the sensor or outside [0, duration_us].
+        `drawn` (plain JSON) are the camera parameters drawn for this sequence, `analyzer` the weights of S0, S1 and S2
+        behind each channel's polarizer, or behind each of its pixels. ValueError, before anything is written, for
+        events out of order, off the sensor or outside [0, duration_us], and for analyzers of another shape.
         """
+        sizes = (NUM_CHANNELS, 3), (NUM_CHANNELS, 3, self.height, self.width)
+        if analyzer is not None and analyzer.shape not in sizes:
+            raise ValueError(f"expected analyzers of shape {sizes[0]} or {sizes[1]}, got {tuple(analyzer.shape)}")
         self._check(channels, duration_us)
         columns = {}
         for name, dtype in COLUMNS.items():  # narrower types, which hold every value that `_check` accepts
@@ -91,7 +106,27 @@ class EventStore(Store):
             "duration_us": int(duration_us),
             "index": [channel.t[::INDEX_STEP].tolist() for channel in channels],
         }
-        self.append(sequence, columns, record | ({"drawn": dict(drawn)} if drawn else {}))
+        record |= {"drawn": dict(drawn)} if drawn else {}
+        maps = {}
+        if analyzer is not None and analyzer.ndim > 2:
+            maps = {ANALYZER: analyzer.numpy()}
+        elif analyzer is not None and not torch.equal(analyzer, IDEAL_ANALYZER):
+            record[ANALYZER] = analyzer.tolist()
+        self.append(sequence, columns, record | ({"maps": list(maps)} if maps else {}), maps)
+
+    def analyzer(self, sequence: str) -> Float32[Tensor, "4 3 *pixels"] | None:
+        """Weights a0, a1, a2 of each channel's pixels: the light behind one is a0 S0 + a1 S1 + a2 S2.
+
+        Shape (4, 3) if all pixels of a channel are alike, else (4, 3, height, width), as
+        `polarnet.simulation.pixel_analyzers` says. None for recordings and for a polarizer that rotates.
+        """
+        record = self.record(sequence)
+        if ANALYZER in record.get("maps", ()):
+            return torch.from_numpy(self.read_array(f"{ANALYZER}/{sequence}", sequence))
+        if ANALYZER in record:
+            return torch.tensor(record[ANALYZER])
+        ideal = "polarizers" in self.attributes and "rotating" not in self.attributes
+        return IDEAL_ANALYZER.clone() if ideal else None
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""

@@ -5,6 +5,7 @@
                                        SHA-256 of each other file of the part, so that the part's digest is that of this
     NAME.zarr/part-00000/t/zarr.json   one column: the rows of these sequences, one sequence after the other
     NAME.zarr/part-00000/t/c/0         its shard; a column of many megabytes has several
+    NAME.zarr/part-00000/MAP/SEQUENCE  an array of one sequence that is no column
 
 Every sequence starts a chunk of its own, so that reading one decodes nothing of its neighbours; the rows between two
 sequences are 0. A store is written as NAME.zarr.tmp. One process writes a part, under a temporary name, and renames it
@@ -27,12 +28,14 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar, cast, get_origin, get_type_hints
 
 import fsspec
 import numpy as np
 import zarr
 from pydantic import PositiveInt
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from polarnet.runtime.files import check_name, check_room, claimed, code_digest, named_shortage, publish, sha256
 from polarnet.runtime.sections import section, section_of
@@ -175,8 +178,14 @@ class Store:
             raise ValueError(f"{self.path}: {unknown_sequence(sequence, self.sequences)}")
         return self._part_of[sequence]
 
-    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
-        """Add the next sequence to its part: rows of every column, and a `record` of plain JSON.
+    def append(
+        self,
+        sequence: str,
+        columns: Mapping[str, np.ndarray],
+        record: Mapping[str, Any],
+        maps: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ) -> None:
+        """Add the next sequence to its part: rows of every column, a `record` of plain JSON, and arrays without rows.
 
         The sequences of a part come in the store's order, from one process; ValueError for another order. The first one
         starts the part anew, the last one completes it; a part that is complete stays unchanged. OSError after a part
@@ -193,6 +202,7 @@ class Store:
             raise ValueError(f"{self.path}: {part} takes its sequences in order, expected {expected}, got {sequence}")
         with named_shortage(Path(self.path)):
             begun.append(sequence, columns, record)
+            begun.maps |= {f"{name}/{sequence}": values for name, values in maps.items()}
             size = self._unfinished.pop(part).finish() if sequence == names[-1] else 0
         if size and not is_url(self.path):
             missing = len(self.parts) - len(list(Path(self.path).glob("part-?????")))
@@ -221,20 +231,25 @@ class Store:
 
     def read_column(self, name: str, sequence: str, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Rows of a sequence from `start` up to `stop` (None: the end); ValueError names an unreadable column."""
-        group, records, arrays = self._open_part(sequence)
+        first, end = self.record(sequence)["rows"]
+        start, stop = first + start, end if stop is None else min(first + stop, end)
+        values = self.read_array(name, sequence, slice(start, stop))
+        if len(values) != max(0, stop - start):
+            error = ValueError(f"expected rows {start} to {stop}, got {len(values)} of them")
+            raise_unreadable(error, f"{self.path}: {sequence}, column {name} of {self.part_of(sequence)}")
+        return values
+
+    def read_array(self, name: str, sequence: str, rows: Any = ...) -> np.ndarray:
+        """An array of a sequence's part, or some rows of it; ValueError names an unreadable one."""
+        group, _, arrays = self._open_part(sequence)
         try:
-            first, end = records[sequence]["rows"]
-            start, stop = first + start, end if stop is None else min(first + stop, end)
             if name not in arrays:
                 if changed := [] if is_url(self.path) else self._changed(self.part_of(sequence), group, name):
                     raise ValueError(f"{changed[0]} is not the file that was written")
                 arrays[name] = group[name]
-            values = np.asarray(arrays[name][start:stop])
-            if len(values) != max(0, stop - start):
-                raise ValueError(f"expected rows {start} to {stop}, got {len(values)} of them")
+            return np.asarray(arrays[name][rows])
         except Exception as error:  # each codec raises its own exceptions
             raise_unreadable(error, f"{self.path}: {sequence}, column {name} of {self.part_of(sequence)}")
-        return values
 
     def read_columns(
         self, sequence: str, names: Collection[str], spans: Sequence[tuple[int, int | None]] = ((0, None),)
@@ -307,6 +322,7 @@ class _Part:
     def __init__(self, path: str, chunk: int):
         self.path = path
         self.records: dict[str, Header] = {}
+        self.maps: dict[str, np.ndarray] = {}
         self._chunk = chunk
         folder = tempfile.gettempdir() if is_url(path) else os.path.dirname(path)
         self._temporary = Path(folder, f"{os.path.basename(path)}.{uuid.uuid4().hex}.tmp")
@@ -330,10 +346,13 @@ class _Part:
         Another process may have given the name to the same bytes.
         """
         self._columns.flush()
+        group = zarr.open_group(self._temporary, mode="r+")
+        for name, values in self.maps.items():
+            group.create_array(name, data=values, chunks=values.shape, compressors=[ZstdCodec(), Crc32cCodec()])
         files = sorted(path for path in self._temporary.rglob("*") if path.is_file())
         digests = {path.relative_to(self._temporary).as_posix(): sha256(path) for path in files}
         del digests[METADATA]
-        zarr.open_group(self._temporary, mode="r+").attrs.put({"sequences": self.records, "sha256": digests})
+        group.attrs.put({"sequences": self.records, "sha256": digests})
         size = sum(path.stat().st_size for path in files)
         if is_url(self.path):
             bucket, name = fsspec.url_to_fs(self.path)

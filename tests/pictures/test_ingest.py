@@ -19,7 +19,7 @@ from polarnet.pictures.manifest import Manifest, read_manifest, split_by_content
 
 CONFIG = IngestConfig(
     source="folder", root="", limit=None, dead_leaves=3, height=100, width=150, max_upscale=2.0, val_fraction=0.1,
-    test_fraction=0.2, mosaic="90 45 / 135 0", residual_max=0.1,
+    test_fraction=0.2, mosaic="90 45 / 135 0", white=None, residual_max=0.1,
 )  # fmt: skip
 
 

@@ -14,12 +14,14 @@ from polarnet.pictures.images import UnreadablePicture
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.polarimetry import (
     Measurement,
+    are_measurements,
     demosaic,
     group_by_measurement,
     parse_raw_mosaic,
     read_intensities,
     read_measurement,
     shrink,
+    white_level,
     write_intensities,
 )
 from polarnet.simulation.presets import MOTIONS
@@ -33,7 +35,7 @@ SONY = parse_mosaic("90 45 / 135 0")
 ANGLES = (0, 45, 90, 135)
 CONFIG = IngestConfig(
     source="polarization", root="", limit=None, dead_leaves=0, height=80, width=120, max_upscale=2.0, val_fraction=0.0,
-    test_fraction=0.0, mosaic="90 45 / 135 0", residual_max=0.1,
+    test_fraction=0.0, mosaic="90 45 / 135 0", white=None, residual_max=0.1,
 )  # fmt: skip
 
 
@@ -112,6 +114,57 @@ def test_12_bits_in_a_16_bit_file_are_recognised(tmp_path):
     measured = read_measurement([tmp_path / "a.npz"], SONY)
     assert measured.intensities[0, 1, 1] == pytest.approx(2000 / 4095 / 2)
     assert not measured.valid[0, 0]
+
+
+@pytest.mark.parametrize(("bits", "width"), [(8, 16), (10, 16), (12, 16), (14, 16), (10, 12), (12, 12), (16, 16)])
+@pytest.mark.parametrize("black", [0, 1, 37])
+def test_bits_that_are_0_below_those_of_the_camera_do_not_raise_its_white(bits, width, black):
+    levels = np.random.default_rng(1).integers(black, 2**bits, (4, 20, 30)).astype(np.uint16)
+    levels[0, 0, 0] = 2**bits - 1
+    assert white_level(levels << (width - bits)) == (2**bits - 1) << (width - bits)
+
+
+def test_a_saturated_angle_of_12_bits_at_the_upper_end_of_16_is_found(tmp_path):
+    """DoLP 0.6 along 0 degrees at S0 = 6000: I0 was 4800, which 12 bits cut at 4095."""
+    levels = np.tile(np.array([4095, 3000, 1200, 3000]).reshape(4, 1, 1), (1, 8, 8))
+    levels[:, 4:] = np.array([801, 501, 201, 501]).reshape(4, 1, 1)
+    save_npz(tmp_path / "a.npz", (levels << 4).astype(np.uint16))
+    measured = read_measurement([tmp_path / "a.npz"], SONY)
+    assert polarization_of(measured)[0][0, 0].item() == pytest.approx(0.6, abs=1e-3)
+    assert measured.saturated == 0.5
+
+
+def test_a_stated_white_level_counts_and_must_hold_all_values(tmp_path):
+    """16 times 12 bits with a dark level of 100 subtracted: no bit is spare, and the file saturates at 65420."""
+    save_npz(
+        tmp_path / "a.npz", np.stack([np.full((8, 8), level, np.uint16) for level in (65420, 32710, 30000, 40000)])
+    )
+    assert not read_measurement([tmp_path / "a.npz"], SONY, white=65420.5).saturated
+    with pytest.raises(UnreadablePicture, match="unsaturated"):
+        read_measurement([tmp_path / "a.npz"], SONY, white=65420.0)
+    with pytest.raises(UnreadablePicture, match=r"levels up to 65000, got 65420; .* ingest\.white or --white"):
+        read_measurement([tmp_path / "a.npz"], SONY, white=65000.0)
+
+
+def test_an_exif_orientation_turns_no_polarizer(tmp_path):
+    """Turned upright by a quarter, light at 30 degrees would be at 120 or 60, and the cells of a mosaic would swap."""
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    for angle, plane in zip(ANGLES, light(), strict=True):
+        Image.fromarray(plane).save(tmp_path / f"scene_{angle}.png", exif=turned)
+    Image.fromarray(raw_mosaic(light())).save(tmp_path / "raw.png", exif=turned)
+    for group in group_by_measurement(sorted(tmp_path.iterdir())):
+        assert math.degrees(polarization_of(read_measurement(group, SONY))[1].mean()) == pytest.approx(30, abs=0.2)
+
+
+def test_numbers_that_count_frames_are_no_angles(tmp_path):
+    """frame_000, frame_001, ... are raw mosaics, each of its own, although some numbers are angles."""
+    for number in range(136):
+        Image.fromarray(raw_mosaic(light(12, 12))).save(tmp_path / f"frame_{number:03d}.png")
+    groups = group_by_measurement(sorted(tmp_path.iterdir()))
+    assert [len(group) for group in groups] == [1] * 136
+    assert not are_measurements(groups)
+    assert read_measurement(groups[45], SONY).valid.shape == (4, 4)
 
 
 def test_one_saturated_angle_follows_from_the_other_three_and_two_are_masked(tmp_path):

@@ -12,7 +12,7 @@ from simulation_fixtures import REST, STILL
 
 from polarnet.simulation.motion import Sine, SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.presets import MOTIONS
-from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp, intensities_from_stokes
 
 CONFIG = dataclasses.replace(MOTIONS["default"], sequences_per_picture=1, speed_min_px_s=60.0, speed_max_px_s=200.0)
@@ -160,16 +160,25 @@ def test_a_quarter_turn_of_the_camera_turns_picture_and_polarization(scene):
     patch = scene.stokes[:, 20:41, 30:51]
     turned = torch.rot90(patch, 1, dims=(1, 2))
     torch.testing.assert_close(frame[0], turned[0], atol=1e-5, rtol=0)
-    # measured from the camera's axes, every angle is 90 degrees less: S1 and S2 change sign
+    # measured from the camera's axes, every angle is 90 degrees more: S1 and S2 change sign
     torch.testing.assert_close(frame[1:], -turned[1:], atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("roll_deg", [-30.0, 10.0, 45.0])
-def test_a_roll_by_a_lowers_the_angle_of_polarization_by_a(roll_deg):
-    uniform = scene_from_rgb(torch.tensor([0.2, 0.8, 0.2]).view(3, 1, 1).expand(3, 60, 80).contiguous())  # 60 degrees
-    frame = render(uniform, still(40.0, 30.0, roll=math.radians(roll_deg)), np.zeros(1), 20, 30)[0]
-    assert math.degrees(aolp(frame)[0, 0]) == pytest.approx((60 - roll_deg) % 180, abs=1e-3)
-    torch.testing.assert_close(dolp(frame), torch.full((20, 30), 0.75))
+@pytest.mark.parametrize("roll_deg", [-20.0, 0.0, 20.0, 90.0])
+def test_a_bar_at_30_degrees_polarized_along_itself_stays_so_while_the_camera_rolls(roll_deg):
+    """Angles count anticlockwise; the camera rolls clockwise, so that it sees both turned by as much."""
+    y, x = torch.meshgrid(torch.arange(61.0) - 30, torch.arange(81.0) - 40, indexing="ij")
+    across = x * math.sin(math.radians(30)) + y * math.cos(math.radians(30))
+    bar = scene_from_polarization(
+        torch.exp(-(across**2) / 20), torch.full_like(x, 0.75), torch.full_like(x, math.pi / 6)
+    )
+    frame = render(bar, still(40.0, 30.0, roll=math.radians(roll_deg)), np.zeros(1), 41, 41)[0].double()
+    y, x = y[10:51, 20:61], x[10:51, 20:61]
+    weight = frame[0] * (x**2 + y**2 <= 400)
+    bar_deg = math.degrees(math.atan2(-2 * float((weight * x * y).sum()), float((weight * (x**2 - y**2)).sum()))) / 2
+    assert bar_deg % 180 == pytest.approx((30 + roll_deg) % 180, abs=0.3)
+    assert math.degrees(aolp(frame)[20, 20]) == pytest.approx((30 + roll_deg) % 180, abs=1e-3)
+    torch.testing.assert_close(dolp(frame), torch.full((41, 41), 0.75, dtype=torch.float64), atol=1e-5, rtol=0)
 
 
 def test_zoom_2_puts_neighbouring_scene_pixels_two_window_pixels_apart(scene):

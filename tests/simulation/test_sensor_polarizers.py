@@ -7,11 +7,21 @@ import re
 import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
 
 from polarnet import stokes
-from polarnet.simulation.camera import IDEAL, PolarizersConfig, split_cells, weights_of
-from polarnet.simulation.motion import Pose, render_poses
-from polarnet.simulation.moving_sensor import channel_light
+from polarnet.simulation.camera import (
+    IDEAL,
+    PERFECT,
+    Camera,
+    PolarizersConfig,
+    pixel_analyzers,
+    split_cells,
+    weights_of,
+)
+from polarnet.simulation.motion import Pose, render_poses, resting_trajectory
+from polarnet.simulation.moving_sensor import channel_light, emulate_motion
+from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 
 FILM = dataclasses.replace(IDEAL, extinction_ratio=[100.0] * 4)
@@ -119,6 +129,51 @@ def test_micropolarizers_differ_between_pixels_as_much_as_stated():
     assert along.std() / along.mean() == pytest.approx(0.04, rel=0.03)
     assert np.log(along / across).std() == pytest.approx(0.3, rel=0.03)
     assert not np.array_equal(weights_of(polarizers, 200, 300, key=8)[0], weights.astype(np.float32))
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.2])
+def test_each_pixel_sees_uniform_light_through_its_analyzer(crosstalk):
+    spread = {
+        "extinction_ratio": [20.0] * 4,
+        "extinction_spread": 0.3,
+        "angle_spread_deg": 3.0,
+        "transmission_spread": 0.1,
+    }
+    four = dataclasses.replace(IDEAL, transmission=[0.7, 0.5, 0.6, 0.4], **spread)
+    dofp = dataclasses.replace(four, layout="dofp", crosstalk=crosstalk)
+    scene = uniform_scene(0.7, 35.0)
+    for polarizers, size in ((four, (20, 30)), (dofp, (10, 15))):
+        analyzer = pixel_analyzers(Camera(SENSORS["clean"], polarizers, key=3), 20, 30)
+        assert analyzer.shape == (4, 3, *size)
+        expected = torch.einsum("cshw,s->chw", analyzer, scene.stokes[:, 0, 0]).double()
+        torch.testing.assert_close(channels_of(scene, polarizers), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("polarizers", [IDEAL, DOFP, dataclasses.replace(FILM, angle_error_deg=[0.0, 1.0, 2.0, 3.0])])
+def test_pixels_that_are_alike_have_one_analyzer_a_channel(polarizers):
+    analyzer = pixel_analyzers(Camera(SENSORS["clean"], polarizers), 20, 30)
+    angles = np.radians(np.add(stokes.POLARIZER_ANGLES_DEG, polarizers.angle_error_deg))
+    ratio = polarizers.extinction_ratio[0] or math.inf
+    torch.testing.assert_close(analyzer, torch.from_numpy(stokes.analyzer(angles, ratio).T).float())
+
+
+@pytest.mark.parametrize("key", [2**64 - 1, -1])
+def test_keys_count_modulo_2_to_the_64(key):
+    polarizers, readout = (
+        dataclasses.replace(IDEAL, angle_spread_deg=1.0),
+        dataclasses.replace(PERFECT, jitter_us=50.0),
+    )
+    cameras = [Camera(SENSORS["noisy"], polarizers, readout, k) for k in (key, key % 2**64)]
+    rest = resting_trajectory(20, 30)
+    ours, same = (emulate_motion(one, uniform_scene(0.5, 30.0), rest, 500_000, (20, 30)) for one in cameras)
+    assert min(map(len, ours)) > 100
+    assert all(map(equal, ours, same))
+
+
+def test_a_spread_at_full_transmission_lowers_its_mean_as_stated():
+    polarizers = dataclasses.replace(IDEAL, transmission_spread=0.03)
+    analyzer = pixel_analyzers(Camera(SENSORS["clean"], polarizers), 200, 300)
+    assert float(2 * analyzer[:, 0].mean()) == pytest.approx(0.988, abs=3e-4)
 
 
 @pytest.mark.parametrize(

@@ -103,13 +103,21 @@ def test_every_picture_of_a_folder_is_for_testing(tmp_path, recipe):
     assert len(FrameStore.open(tmp_path / "set" / "frames.zarr").of_split("test")) == 3
 
 
-def test_the_kind_is_seen_in_the_names(tmp_path):
-    (tmp_path / "one.jpg").touch()
-    assert kind_of(tmp_path) == "photographs"
-    for angle in (0, 45, 90, 135):
-        (tmp_path / f"plate_{angle}.png").touch()
-    assert kind_of(tmp_path) == "polarization"
-    for path in tmp_path.iterdir():
-        path.unlink()
-    (tmp_path / "plate.npz").touch()
-    assert kind_of(tmp_path) == "polarization"
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        ([f"frame_{k:04d}" for k in range(140)], "photographs"),
+        ([f"frame_{k:03d}" for k in range(140)], "photographs"),
+        ([f"frame_{k}" for k in range(0, 140, 5)], "photographs"),
+        (["cup_0", "vase_0", "lamp_45"], "photographs"),
+        (["cup_0", "cup_45", "cup_90", "cup_135", "view"], "photographs"),
+        (["view"], "photographs"),
+        (["cup.npz"], "polarization"),
+        (["cup_000", "cup_045", "cup_090", "cup_135"], "polarization"),
+        (["cup_0", "cup_45", "cup_90"], "polarization"),  # ingest names the missing file
+    ],
+)
+def test_numbers_in_names_are_angles_only_if_all_files_are_measurements(tmp_path, names, kind):
+    for name in names:
+        (tmp_path / (name if "." in name else f"{name}.png")).touch()
+    assert kind_of(tmp_path) == kind

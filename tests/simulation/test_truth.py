@@ -16,10 +16,11 @@ from simulation_fixtures import REST, STILL
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
-from polarnet.simulation.camera import grid
+from polarnet.simulation.camera import IDEAL, Grid, grid, weights_of
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
+from polarnet.simulation.moving_sensor import channel_light
 from polarnet.simulation.presets import MOTIONS
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage.frames import FrameStore
@@ -41,7 +42,7 @@ def images(tmp_path_factory) -> Path:
         coarse.resize((120, 80), Image.Resampling.BICUBIC).save(root / "pictures" / f"{i}.png")
     config = IngestConfig(
         source="folder", root=str(root / "pictures"), limit=None, dead_leaves=0, height=80, width=120, max_upscale=2.0,
-        val_fraction=0.2, test_fraction=0.2, mosaic="90 45 / 135 0", residual_max=0.1,
+        val_fraction=0.2, test_fraction=0.2, mosaic="90 45 / 135 0", white=None, residual_max=0.1,
     )  # fmt: skip
     logging.disable(logging.WARNING)
     ingest(config, 1, root / "images", map)
@@ -169,7 +170,7 @@ def test_a_pixel_is_valid_unless_its_interpolation_uses_a_masked_one(x, y, expec
     valid = torch.ones(12, 16, dtype=torch.bool)
     valid[7, 8] = False
     trajectory = Trajectory(x, y, REST, REST, STILL, STILL, speed_px_s=1.0)
-    (seen,) = valid_frames(valid, trajectory, [0], height=6, width=6)  # its first pixel looks at (x, y) - 2.5
+    (seen,) = valid_frames(valid, trajectory, [0], Grid(6, 6))  # its first pixel looks at (x, y) - 2.5
     assert [tuple(place) for place in (~seen).nonzero().tolist()] == expected
 
 
@@ -179,12 +180,31 @@ def test_the_mask_of_a_turning_window_is_that_of_its_weights():
     light = torch.rand(3, 60, 80, generator=generator)
     valid = torch.rand(60, 80, generator=generator) < 0.98
     trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
-    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], 24, 36)
+    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], Grid(24, 36))
     t_s = np.array([0, 0.05, 0.1])
     changed = torch.where(valid, light, light + 1)
     before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
     assert torch.equal(rendered, before == after)
     assert 0.8 < rendered.float().mean() < 0.98
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.2])
+def test_a_cell_is_valid_unless_its_truth_or_light_changes_with_masked_pixels(crosstalk):
+    polarizers = dataclasses.replace(IDEAL, layout="dofp", crosstalk=crosstalk)
+    light = scene_from_rgb(torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(1))).stokes
+    valid = torch.ones(60, 80, dtype=torch.bool)
+    valid[5::9, 4::9] = False
+    trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
+
+    def seen(planes):
+        scene, t_s = PolarizationScene(planes), np.array([0, 0.05, 0.1])
+        sensor = render(scene, trajectory, t_s, 24, 36).transpose(0, 1).numpy()
+        cells = channel_light(sensor, polarizers, weights_of(polarizers, 24, 36, 0))
+        return torch.cat([torch.from_numpy(cells).transpose(0, 1), render(scene, trajectory, t_s, 12, 18, 2)], dim=1)
+
+    changed = (seen(light) != seen(torch.where(valid, light, light + torch.eye(3, 1)[..., None]))).any(dim=1)
+    assert torch.equal(valid_frames(valid, trajectory, [0, 50_000, 100_000], Grid(12, 18, 2), crosstalk), ~changed)
+    assert 0.1 < changed.float().mean() < 0.9
 
 
 def test_the_number_of_threads_changes_no_bit_of_a_frame():

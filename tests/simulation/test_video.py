@@ -1,5 +1,6 @@
 """Simulation in pieces, of moving sensors and of videos, and interpolated frames."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -104,6 +105,22 @@ def test_an_interpolated_frame_is_the_moved_picture_and_a_blend_is_not():
         inner = np.s_[:, 6:-6, 6:-6]
         blend = (1 - share) * first + share * last
         assert (frame.stokes - moved)[inner].abs().mean() < 0.25 * (blend - moved)[inner].abs().mean()
+
+
+@pytest.mark.parametrize(("degree", "angle"), [(0.8, None), (None, 0.3), (None, 0.3 + math.pi / 4)])
+def test_texture_of_polarization_alone_moves_too(degree, angle):
+    """AoLP or DoLP moves by 8 pixels; S0 is the same everywhere."""
+    whole, large = torch.ones(H, W), picture(H, W + 9)[0]
+    stokes = []
+    for k in (0, 4, 8):
+        texture = large[:, k : k + W]
+        dolp, aolp = (texture if one is None else one * whole for one in (degree, angle))
+        stokes.append(scene_from_polarization(0.8 * whole, dolp, aolp).stokes)
+    dense = list(upsampled([StokesFrame(0, stokes[0]), StokesFrame(16_000, stokes[2])]))
+    assert 8 <= len(dense) - 1 <= 12
+    middle = min(dense, key=lambda frame: abs(frame.t_us - 8000)).stokes
+    inner, blend = np.s_[:, 6:-6, 9:-9], (stokes[0] + stokes[2]) / 2
+    assert (middle - stokes[1])[inner].abs().mean() < 0.5 * (blend - stokes[1])[inner].abs().mean()
 
 
 def test_upsampling_leaves_at_least_a_microsecond_between_frames_and_adds_none_to_a_still_video():

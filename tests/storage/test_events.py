@@ -16,7 +16,7 @@ from zarr.storage import LocalStore
 
 import polarnet.storage.events as store_module
 from polarnet.events.stream import Events, slice_time
-from polarnet.storage.events import MAX_DURATION_US, EventStore
+from polarnet.storage.events import IDEAL_ANALYZER, MAX_DURATION_US, EventStore
 
 HEIGHT, WIDTH = 12, 18
 DURATIONS_US = {"coffee": 1_000_000, "leaves": 250_500, "still": 40_000}
@@ -48,6 +48,31 @@ def test_events_come_back_as_they_were(finished, channels):
         assert store.duration_us(name) == DURATIONS_US[name]
         assert store.count(name) == COUNTS[name]
         assert all(equal(a, b) for a, b in zip(store.read(name), channels[name], strict=True))
+
+
+def test_analyzers_come_back_and_ideal_ones_take_no_room(channels, tmp_path):
+    uniform = torch.rand(4, 3, generator=torch.Generator().manual_seed(1))
+    spread = torch.rand(4, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+
+    def written(name, analyzers, attributes) -> EventStore:
+        store = EventStore.create(tmp_path / name, list(DURATIONS_US), HEIGHT, WIDTH, attributes, 2)
+        for sequence, analyzer in zip(DURATIONS_US, analyzers, strict=True):
+            store.write(sequence, channels[sequence], DURATIONS_US[sequence], analyzer=analyzer)
+        store.finish()
+        assert EventStore.verify(tmp_path / name) == []
+        return EventStore.open(tmp_path / name)
+
+    store = written("some.zarr", [spread, uniform, IDEAL_ANALYZER], {"polarizers": {}})
+    for sequence, expected in zip(DURATIONS_US, [spread, uniform, IDEAL_ANALYZER], strict=True):
+        assert torch.equal(store.analyzer(sequence), expected)
+        assert all(equal(a, b) for a, b in zip(store.read(sequence), channels[sequence], strict=True))
+    assert written("recorded.zarr", [None] * 3, {}).analyzer("coffee") is None
+    written("simulated.zarr", [IDEAL_ANALYZER] * 3, {})
+    assert files_of(tmp_path / "recorded.zarr") == files_of(tmp_path / "simulated.zarr")
+    with pytest.raises(ValueError, match=r"analyzers of shape \(4, 3\) or \(4, 3, 12, 18\), got \(4, 3, 2, 2\)"):
+        EventStore.create(tmp_path / "x", ["coffee"], HEIGHT, WIDTH, {}).write(
+            "coffee", [], 1, None, spread[..., :2, :2]
+        )
 
 
 def test_any_zarr_reader_finds_a_channel_by_its_offsets(finished, channels):
