@@ -16,7 +16,7 @@ from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range,
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import Columns, empty_columns
+from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
 from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.ranges import RandomisedConfig
@@ -122,7 +122,7 @@ def emulate(
     fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
     clip. `key` (64 bits) seeds all noise, which each channel draws by its number in `channels` (default: 0, 1, ...).
     Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels. TypeError
-    for anything but an array; ValueError for times that do not increase, values that are not finite or outside
+    for anything but an array; ValueError for times that `_checked_times` refuses, values that are not finite or outside
     0..255, and sizes that do not fit.
 
     >>> import torch
@@ -168,12 +168,15 @@ def emulate_lights(
     state: SensorState | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
+    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once.
+
+    ValueError for times that `_checked_times` refuses.
+    """
     forget_stale_code()
     numbers, height, width, config, key = channels
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key)
-    times = t_us if state is None else np.concatenate([[state.t_us], t_us])
+    times = _checked_times(t_us if state is None else np.concatenate([[state.t_us], t_us]))
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
@@ -198,6 +201,27 @@ def emulate_lights(
     return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
 
 
+def _checked_times(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """The times of frames, the last one of the state before them included.
+
+    ValueError for NaN, times beyond 2^53 us, times that do not increase, and steps of more than 2^32 us (71 minutes).
+    """
+    wrong, steps = ~(np.abs(times) <= MAX_TIME_US), np.diff(times)
+    wrong[1:] |= ~(steps > 0)
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise ValueError(
+            f"emulate: expected strictly increasing times in us, of at most 2^53, got {times[max(k - 2, 0) : k + 1]}"
+        )
+    if len(steps) and steps.max() > MAX_STEP_US:
+        k = int(steps.argmax())
+        raise ValueError(
+            f"emulate: expected at most {MAX_STEP_US * 1e-6:.0f} s from one frame to the next, got {steps[k] * 1e-6:g} "
+            f"s after {times[k]} us; insert frames, or scale the times down"
+        )
+    return times
+
+
 def _check_frames(
     frames: Tensor, times: Float64[np.ndarray, " m"], channels: tuple[int, ...], state: SensorState | None, model: str
 ) -> None:
@@ -213,10 +237,6 @@ def _check_frames(
         check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
     if len(set(channels)) != frames.shape[1]:
         raise ValueError(f"emulate: expected {frames.shape[1]} different channel numbers, got {channels}")
-    before = times if state is None else np.concatenate([[state.t_us], times])
-    if not (np.isfinite(before).all() and (np.diff(before) > 0).all()):
-        after = "" if state is None else f", the first after the state's {state.t_us}"
-        raise ValueError(f"emulate: expected strictly increasing times in us{after}, got {times[:5].tolist()}...")
     if state is not None:
         theirs = f"model {state.model}, channels {state.channels} of {state.height}x{state.width} pixels"
         ours = f"model {model}, channels {channels} of {frames.shape[2]}x{frames.shape[3]} pixels"

@@ -30,6 +30,7 @@ from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, 
 EIGHT_BIT_VIDEO = False
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
+EPSILON = 2.0**-52
 BATCH = 2000  # minimum number of active pixels that are followed in one pass, except for the last strip
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
@@ -376,10 +377,13 @@ def _jittered_leak(nominal, jitter, key, i, number):
 
 @compiled
 def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
-    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark."""
+    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark.
+
+    Never less than float64 resolves at that time: the next draw of the pixel would be the same one.
+    """
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
     rate_hz = physics.shot_noise_rate_hz / 2 * DARK_SHOT_NOISE * share
-    return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz
+    return max(-1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz, abs(time_us) * EPSILON)
 
 
 @compiled

@@ -13,6 +13,7 @@ from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import inlined
 from polarnet.simulation.pixels import randomness
 
+MAX_RATE_HZ = 1e5  # a pixel's refractory period allows no more
 THRESHOLD_FLOOR = 0.01  # natural-log intensity: v2e clips drawn thresholds here
 DARK_OFFSET = 20.0  # DN: bandwidth and shot noise follow (DN + 20) / 275
 SATURATION = 275.0
@@ -38,13 +39,13 @@ class PixelConfig:
 
     Photoreceptor and source follower are together a second-order low-pass (Lichtsteiner et al., JSSC 2008).
     """
-    leak_rate_hz: NonNegativeFloat
+    leak_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """ON events per second of a pixel that sees no change."""
     leak_jitter: Annotated[float, Field(ge=0, le=1)]
     """Relative standard deviation of the leak: in each frame for `v2e`, in each interval of events for `exact`."""
-    noise_rate_cov_decades: NonNegativeFloat
+    noise_rate_cov_decades: Annotated[float, Field(ge=0, le=1)]
     """Standard deviation between pixels of the decimal logarithm of the leak rate."""
-    shot_noise_rate_hz: NonNegativeFloat
+    shot_noise_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
     refractory_period_us: NonNegativeFloat
 

@@ -76,6 +76,7 @@ def start(light, pixels, steps):
     pixels.filtered[:] = pixels.memory[:] = linlog
     if pixels.photoreceptor.size:
         pixels.photoreceptor[:] = linlog
+    pixels.refractory_since[:] += np.float32(min(steps.times_us[0], 0.0) * 1e-6)
 
 
 @compiled
