@@ -24,7 +24,8 @@ from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_o
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
 from polarnet.simulation.moving_sensor import channel_light, emulate_motion
-from polarnet.simulation.pixels.light import KNEE, linlog
+from polarnet.simulation.pixels.light import KNEE, respond
+from polarnet.simulation.pixels.physics import physics_of
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import (
@@ -65,7 +66,7 @@ def pixel_figure(figure: Figure) -> None:
 
 def _draw_response(axes: Axes) -> None:
     light, response = np.arange(256, dtype=np.float32), np.empty(256, np.float32)
-    linlog(light, response)
+    respond(light, physics_of(QUIET), response)
     axes.plot(light, response, **LINE)
     axes.axvline(KNEE, color=LIGHT.grid, linewidth=1, zorder=0)
     axes.annotate("logarithm", (90, float(response[90])), (95, 3.6), color=LIGHT.quiet, fontsize=8)
@@ -81,7 +82,7 @@ def _draw_photoreceptor(axes: Axes) -> None:
     for light_dn, colour in zip((200.0, 60.0, 15.0), COLOURS, strict=False):
         light = np.where(t_us < 5_000, light_dn / 1.25, light_dn)
         ends = np.empty(2, np.float32)
-        linlog(np.array([light_dn / 1.25, light_dn], np.float32), ends)
+        respond(np.array([light_dn / 1.25, light_dn], np.float32), physics_of(QUIET), ends)
         events = events_under(light, t_us, config)
         t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1] - ends[0])
         axes.step(np.r_[0, t_ms, 60], np.r_[0, rise, rise[-1:]], where="post", color=colour, linewidth=1.2)

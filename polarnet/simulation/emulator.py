@@ -43,6 +43,7 @@ class PixelModel(Protocol):
     """A pixel model: a module of `polarnet.simulation.pixels`. `start` and `advance` are compiled kernels."""
 
     EIGHT_BIT_VIDEO: bool  # whether the model sees whole digital numbers at regular times
+    OPTIONS: tuple[str, ...]  # the names in `OFF` that the model has
 
     def physics_of(self, config: "EmulatorConfig") -> Any:
         """The model's parameters as a NamedTuple."""
@@ -57,6 +58,8 @@ class PixelModel(Protocol):
         """Advance the pixels through the steps, in place; return the columns with the events, and their number."""
 
 
+OFF = {"dark_dn": None, "photoreceptor_noise": 0.0, "refractory": "keep"}
+"""Values that switch off the parameters that only some models have; others refuse any other value."""
 MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_voltmeter": voltmeter}
 
 
@@ -64,7 +67,8 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A model ignores the parameters that it does not have. Ranges in `randomise` are drawn before (`Camera.drawn`).
+    A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
+    before (`Camera.drawn`).
 
     >>> from dataclasses import replace
     >>> from polarnet.simulation import SENSORS
@@ -75,6 +79,16 @@ class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, 
     model: Annotated[str, one_of(MODELS)]
     render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
+
+    def __post_init__(self):
+        esim.EsimConfig.__post_init__(self)
+        RandomisedConfig.__post_init__(self)
+        for name, off in OFF.items():
+            value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
+            if value != off and self.model not in having:
+                raise ValueError(
+                    f"{name}: expected {off} with model {self.model}, got {value}; models with it: {', '.join(having)}"
+                )
 
 
 @dataclass(frozen=True)
@@ -149,10 +163,13 @@ def emulate_frames(
     state: SensorState | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """As `emulate`, for times and light in DN that come in pieces; models of 8-bit video see it rounded."""
-    parts = []
+    """As `emulate`, for times and light in DN that come in pieces.
+
+    Models of 8-bit video see it rounded, unless `dark_dn` asks for light below 1 DN.
+    """
+    parts, sensor = [], channels.sensor
     for t_us, light in pieces:
-        if MODELS[channels.sensor.model].EIGHT_BIT_VIDEO:
+        if MODELS[sensor.model].EIGHT_BIT_VIDEO and sensor.dark_dn is None:
             light = (light + np.float32(0.5)).astype(np.uint8)
         lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
         events, state = emulate_lights(channels, lights, t_us.astype(np.float64), state, threads)

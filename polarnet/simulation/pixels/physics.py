@@ -9,10 +9,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat
 
-from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import inlined
+from polarnet.runtime.sections import one_of, section
+from polarnet.simulation.compilation import borrowing, inlined
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.pixels.light import FULL_SCALE, MIN_DARK_DN
+from polarnet.simulation.pixels.randomness import mixed, normal, uniform
 
+MIN_KNEE_DN = 2.72  # about e, where the linear part and the logarithm have one slope
+NO_KNEE_DN = -1.0
 MAX_RATE_HZ = 1e5  # a pixel's refractory period allows no more
 THRESHOLD_FLOOR = 0.01  # natural-log intensity: v2e clips drawn thresholds here
 DARK_OFFSET = 20.0  # DN: bandwidth and shot noise follow (DN + 20) / 275
@@ -25,6 +29,10 @@ DARK_SHOT_NOISE = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION  # fraction of
 class PixelConfig:
     """Parameters of v2e's pixel. Contrast thresholds are steps of natural-log intensity."""
 
+    knee_dn: Annotated[float, Field(ge=MIN_KNEE_DN, le=FULL_SCALE)]
+    """Light in DN below which the response is linear, and logarithmic above; without effect if `dark_dn` is set."""
+    dark_dn: Annotated[float, Field(ge=0, le=FULL_SCALE)] | None
+    """Dark current of the photodiode in DN: the response is ln(light + dark_dn), without a knee; null: v2e's."""
     contrast_threshold_on: Annotated[float, Field(ge=0.01, le=10)]
     contrast_threshold_off: Annotated[float, Field(ge=0.01, le=10)]
     contrast_threshold_sigma_on: NonNegativeFloat
@@ -34,6 +42,11 @@ class PixelConfig:
     """Correlation of a pixel's ON and OFF thresholds."""
     cutoff_hz: NonNegativeFloat
     """Bandwidth of the photoreceptor at full brightness, less in the dark; 0: infinite."""
+    photoreceptor_noise: Annotated[float, Field(ge=0, le=1)]
+    """Standard deviation of the noise at the photoreceptor's output, natural-log intensity, in any light.
+
+    It passes the low-pass of `cutoff_hz` at full brightness, as in v2e, so that ON and OFF events alternate.
+    """
     source_follower_hz: NonNegativeFloat
     """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
 
@@ -48,29 +61,49 @@ class PixelConfig:
     shot_noise_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
     refractory_period_us: NonNegativeFloat
+    refractory: Annotated[str, one_of(("keep", "reset"))]
+    """What happens to a change of light within the refractory period: it is kept and reported later, or the pixel is
+    held in reset and forgets it: its reference is then the light at the end of the period."""
+
+    def __post_init__(self):
+        if self.photoreceptor_noise and not self.cutoff_hz:
+            raise ValueError(
+                f"photoreceptor_noise: expected 0 without a photoreceptor bandwidth that filters it, got "
+                f"{self.photoreceptor_noise}; set cutoff_hz"
+            )
 
 
 class Physics(NamedTuple):
     """`PixelConfig` for compiled kernels, in v2e's units."""
 
+    knee_dn: float  # NO_KNEE_DN: the response has none
+    knee_slope: float  # of the response below the knee, per DN
+    dark_dn: float
     threshold_on: float
     threshold_off: float
     threshold_sigma_on: float
     threshold_sigma_off: float
     threshold_correlation: float
     cutoff_hz: float
+    photoreceptor_noise: float
     source_follower_hz: float
     leak_rate_hz: float
     leak_jitter: float
     noise_rate_cov_decades: float
     shot_noise_rate_hz: float
     refractory_s: float
+    holds: bool  # whether the pixel is held in reset for the refractory period
 
 
 def physics_of(config: PixelConfig) -> Physics:
     """The parameters of `config`, with the refractory period in seconds."""
     values = {name.removeprefix("contrast_"): value for name, value in vars(config).items()}
+    values["knee_slope"] = math.log(config.knee_dn) / config.knee_dn
+    values["dark_dn"] = 0.0
+    if config.dark_dn is not None:
+        values["dark_dn"], values["knee_dn"] = max(config.dark_dn, MIN_DARK_DN), NO_KNEE_DN
     values["refractory_s"] = config.refractory_period_us * 1e-6
+    values["holds"] = config.refractory == "reset"
     return Physics(*(values[name] for name in Physics._fields))
 
 
@@ -107,3 +140,18 @@ def _threshold_map(nominal: float, sigma: float, deviations: np.ndarray) -> np.n
 def shot_noise_fraction(dn):
     """Shot-noise rate at `dn` relative to the nominal rate: 0.95 in the dark, 0.25 at 255 DN."""
     return 1 - SHOT_NOISE_SLOPE * (np.float64(dn) + DARK_OFFSET) / SATURATION
+
+
+@borrowing
+def wander(noise, key, first_pixel, physics, dt_s, rise):
+    """Move the photoreceptor's noise on by `dt_s`, and add its change to `rise`.
+
+    White noise behind a first-order low-pass (an Ornstein-Uhlenbeck process): its deviation and its spectrum do not
+    depend on the frame rate. Its numbers are Gaussian far into the tails, because only those cross thresholds.
+    """
+    a = 2 * math.pi * physics.cutoff_hz * dt_s
+    lost, fresh = -math.expm1(-a), physics.photoreceptor_noise * math.sqrt(-math.expm1(-2 * a))
+    for j in range(noise.size):
+        change = np.float32(fresh * normal(uniform(mixed(key, first_pixel + j))) - lost * noise[j])
+        noise[j] += change
+        rise[j] += change
