@@ -280,3 +280,16 @@ def test_a_leak_of_a_pixel_held_in_reset_starts_anew_after_each_period():
     config = of("exact", leak_rate_hz=10.0, refractory_period_us=150_000.0, refractory="reset")
     (events,), _ = emulate(torch.full((101, 1, 1, 1), 90.0), 100_000 * np.arange(101), config, key=1)
     assert events.t.diff().tolist() == pytest.approx([250_000] * (len(events) - 1), abs=2)
+
+
+@pytest.mark.parametrize("name", ["davis346", "gen41", "celex5"])
+def test_presets_of_real_cameras_fire_signal_and_noise_over_six_decades(name):
+    """Their thresholds are crossed as often at 1 DN as at 100 DN, and rarely at a thousandth of their dark current."""
+    t_us = 1000.0 * np.arange(1001)
+    swing = np.exp(np.sin(2 * math.pi * t_us / 1e6 - math.pi / 2))
+    levels = np.array([1e-4, 1.0, 90.0]).repeat(400)
+    frames = np.minimum(swing[:, None] * levels, 255).astype(np.float32).reshape(-1, 1, 1, 1200)
+    (events,), _ = emulate(frames, t_us, SENSORS[name], key=1)
+    dark, dim, bright = torch.bincount(events.x.long() // 400, minlength=3).tolist()
+    assert dim == pytest.approx(bright, rel=0.15)
+    assert 0 < dark < 0.2 * dim

@@ -109,6 +109,18 @@ def test_thresholds_are_nominal_without_mismatch_and_never_below_a_hundredth():
     assert off.std() == pytest.approx(0.03, rel=0.12)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.55])
+def test_a_relative_mismatch_is_a_share_of_any_threshold_and_has_no_pixels_near_zero(share):
+    changes = {"contrast_threshold_mismatch_on": share, "contrast_threshold_mismatch_off": None}
+    for nominal in (0.08, 0.3):
+        physics = physics_of(replace(SENSORS["default"], contrast_threshold_on=nominal, **changes))
+        on, off, _ = mismatch(physics, 20_000, KEY, 0)
+        assert on.mean() == pytest.approx(nominal, rel=0.02)
+        assert on.std() / on.mean() == pytest.approx(share, rel=0.05)
+        assert (on < 0.15 * nominal).mean() < 1e-3
+        assert off.std() == pytest.approx(0.03, rel=0.05)
+
+
 def test_leak_rates_spread_by_a_tenth_of_a_decade_around_the_nominal_one():
     physics = physics_of(SENSORS["default"])._replace(noise_rate_cov_decades=0.1)
     normal = randomness.normal_map(KEY, randomness.NOISE_RATE, 0, PIXELS)

@@ -38,6 +38,12 @@ class PixelConfig:
     contrast_threshold_sigma_on: NonNegativeFloat
     """Standard deviation of the ON threshold between pixels, drawn for each channel."""
     contrast_threshold_sigma_off: NonNegativeFloat
+    contrast_threshold_mismatch_on: Annotated[float, Field(ge=0, le=1)] | None
+    """Standard deviation of the ON threshold between pixels as a share of it, in place of the sigma; null: the sigma.
+
+    Thresholds are log-normal then, so that none comes near 0: a normal one with a mismatch of 55 % often would.
+    """
+    contrast_threshold_mismatch_off: Annotated[float, Field(ge=0, le=1)] | None
     contrast_threshold_correlation: Annotated[float, Field(ge=-1, le=1)]
     """Correlation of a pixel's ON and OFF thresholds."""
     cutoff_hz: NonNegativeFloat
@@ -83,6 +89,8 @@ class Physics(NamedTuple):
     threshold_off: float
     threshold_sigma_on: float
     threshold_sigma_off: float
+    threshold_mismatch_on: float  # share of the threshold; 0: the deviation is `threshold_sigma_on`
+    threshold_mismatch_off: float
     threshold_correlation: float
     cutoff_hz: float
     photoreceptor_noise: float
@@ -98,6 +106,10 @@ class Physics(NamedTuple):
 def physics_of(config: PixelConfig) -> Physics:
     """The parameters of `config`, with the refractory period in seconds."""
     values = {name.removeprefix("contrast_"): value for name, value in vars(config).items()}
+    for name in ("threshold_mismatch_on", "threshold_mismatch_off"):
+        if values[name] is not None:
+            values[name.replace("mismatch", "sigma")] = 0.0
+        values[name] = values[name] or 0.0
     values["knee_slope"] = math.log(config.knee_dn) / config.knee_dn
     values["dark_dn"] = 0.0
     if config.dark_dn is not None:
@@ -110,13 +122,14 @@ def physics_of(config: PixelConfig) -> Physics:
 def mismatch(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """ON and OFF thresholds of a channel's pixels, and their leak rates relative to the nominal rate, float32.
 
-    Thresholds are normally distributed, at least `THRESHOLD_FLOOR`; leak rates log-normally.
+    Thresholds are at least `THRESHOLD_FLOOR`, and normally distributed, or log-normally with a relative mismatch. Leak
+    rates are log-normal.
     """
-    share, sigma_on, sigma_off = physics.threshold_correlation, physics.threshold_sigma_on, physics.threshold_sigma_off
-    on = off = np.zeros(pixels, np.float32)
-    if sigma_on or (sigma_off and share):
+    share, on = physics.threshold_correlation, np.zeros(pixels, np.float32)
+    off, varies_off = on, physics.threshold_sigma_off or physics.threshold_mismatch_off
+    if physics.threshold_sigma_on or physics.threshold_mismatch_on or (varies_off and share):
         on = randomness.normal_map(key, randomness.THRESHOLD_ON, channel, pixels)
-    if sigma_off:
+    if varies_off:
         off = randomness.normal_map(key, randomness.THRESHOLD_OFF, channel, pixels)
     if share:
         off = np.float32(share) * on + np.float32(math.sqrt(1 - share * share)) * off
@@ -124,16 +137,22 @@ def mismatch(physics: Physics, pixels: int, key: np.uint64, channel: int) -> tup
     if cov_decades := physics.noise_rate_cov_decades:
         exponents = np.float32(cov_decades) * randomness.normal_map(key, randomness.NOISE_RATE, channel, pixels)
     return (
-        _threshold_map(physics.threshold_on, sigma_on, on),
-        _threshold_map(physics.threshold_off, sigma_off, off),
+        _threshold_map(physics.threshold_on, physics.threshold_sigma_on, physics.threshold_mismatch_on, on),
+        _threshold_map(physics.threshold_off, physics.threshold_sigma_off, physics.threshold_mismatch_off, off),
         (10 ** exponents.astype(np.float64)).astype(np.float32),  # powers in float32 depend on the processor
     )
 
 
-def _threshold_map(nominal: float, sigma: float, deviations: np.ndarray) -> np.ndarray:
-    if sigma == 0:
+def _threshold_map(nominal: float, sigma: float, mismatch: float, deviations: np.ndarray) -> np.ndarray:
+    if mismatch:
+        variance = math.log1p(mismatch * mismatch)  # of the logarithm; the mean of the thresholds is `nominal`
+        exponents = math.sqrt(variance) * deviations.astype(np.float64) - variance / 2
+        thresholds = (nominal * np.exp(exponents)).astype(np.float32)
+    elif sigma == 0:
         return np.full(len(deviations), nominal, np.float32)
-    return np.maximum(np.float32(nominal) + np.float32(sigma) * deviations, np.float32(THRESHOLD_FLOOR))
+    else:
+        thresholds = np.float32(nominal) + np.float32(sigma) * deviations
+    return np.maximum(thresholds, np.float32(THRESHOLD_FLOOR))
 
 
 @inlined

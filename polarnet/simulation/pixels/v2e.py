@@ -180,9 +180,9 @@ def _count(pixels, output, physics, first, candidates, firing, crossed, n, most)
         i = first + x
         change = np.float64(output[i] - pixels.memory[i])
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-        if double and physics.threshold_sigma_on == 0:
+        if double and physics.threshold_sigma_on == 0 and physics.threshold_mismatch_on == 0:
             on = physics.threshold_on
-        if double and physics.threshold_sigma_off == 0:
+        if double and physics.threshold_sigma_off == 0 and physics.threshold_mismatch_off == 0:
             off = physics.threshold_off
         firing[n], crossed[n] = i, np.int32(change / (on if change > 0 else off))
         most = max(most, abs(crossed[n]))
