@@ -3,6 +3,7 @@
 Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
 """
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -53,6 +54,11 @@ CONSTANT_SPEED_PX_S = 97.3
 FLAT_HEIGHT, FLAT_WIDTH = 40, 200
 SETTLING_FRAMES = 6  # until each pixel has fired, and its memory is that of an endless motion
 SIZE = (200, 300)  # rows and columns of the sensor behind the presets
+EVENT_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": COLOURS[0]}, {"color": COLOURS[2]}, {"color": COLOURS[3]}, {"color": ON},
+    {"color": COLOURS[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
+    {"color": LIGHT.quiet, "linestyle": "-."},
+)  # fmt: skip
 LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
 
 
@@ -329,6 +335,39 @@ def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:
     return dolp(stokes_from_intensities(intensities))
 
 
+@drawn(9.0, 2.9)
+def light_figure(figure: Figure) -> None:
+    """Draw the sensitivity over light, the events of each pixel model, and the DoLP error of dimmed scenes."""
+    sensitivity, events, error = figure.subplots(1, 3)
+    light = np.geomspace(255e-6, 255, 400).astype(np.float32)
+    for (label, changes), colour in zip(
+        {
+            "knee_dn 20, v2e": {}, "knee_dn 2.72": {"knee_dn": 2.72}, "dark_dn 20": {"dark_dn": 20.0},
+            "dark_dn 5": {"dark_dn": 5.0}, "dark_dn 0.02": {"dark_dn": 0.02},
+        }.items(),
+        (*COLOURS, ON), strict=True,
+    ):  # fmt: skip
+        physics, ends = physics_of(replace(QUIET, **changes)), np.empty((2, len(light)), np.float32)
+        for factor, end in zip((0.95, 1.05), ends, strict=True):
+            respond(light * np.float32(factor), physics, end)
+        sensitivity.semilogx(light, (ends[1] - ends[0]) / math.log(1.05 / 0.95), color=colour, lw=1.4, label=label)
+    sensitivity.set(xlabel="light, DN", ylabel="response per ln light", ylim=(0, 3.2))
+    sensitivity.legend(fontsize=7, frameon=False, loc="upper left")
+    sensitivity.set_title("sensitivity", loc="left", fontsize=9)
+    results = json.loads((ROOT / "docs" / "results" / "light.json").read_text())
+    for (label, rates), style in zip(results["events"]["per_second"].items(), EVENT_STYLES, strict=True):
+        events.semilogx(results["events"]["levels_dn"], rates, linewidth=1.4, label=label, **style)
+    events.set(xlabel="brightest light, DN", ylabel="events per second", ylim=(0, 48))
+    events.legend(fontsize=6, frameon=False, loc="upper left")
+    events.set_title("a swing by e² once a second", loc="left", fontsize=9)
+    for (dark, by_light), colour in zip(results["dolp"]["mse"].items(), (*COLOURS[:3], ON), strict=True):
+        label = "v2e's response" if dark == "None" else f"dark_dn {float(dark):g}"
+        error.loglog([*map(float, by_light)], [*by_light.values()], "o-", color=colour, lw=1.4, ms=3, label=label)
+    error.set(xlabel="light of the scene, share", ylabel="MSE of DoLP")
+    error.legend(fontsize=7, frameon=False)
+    error.set_title("shipped network, generated scenes", loc="left", fontsize=9)
+
+
 FIGURES = {
     "theory_malus": malus_figure,
     "theory_gains": gains_figure,
@@ -336,6 +375,7 @@ FIGURES = {
     "physics_polarizers": polarizers_figure,
     "physics_readout": readout_figure,
     "physics_rate": rate_figure,
+    "physics_light": light_figure,
 }
 
 

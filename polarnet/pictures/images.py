@@ -209,8 +209,8 @@ def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
     picture = read_picture(path)
     if picture.pixels.dtype != np.float32 or "lin" not in picture.colour_space or not picture.pixels.max() > 0:
         raise UnreadablePicture(
-            f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} in "
-            f"{picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
+            f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} "
+            f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
         )
     light = np.clip(picture.pixels, 0, None) / picture.pixels.max()
     return torch.from_numpy(np.ascontiguousarray(light.transpose(2, 0, 1)))

@@ -142,7 +142,7 @@ def test_light_of_an_exr_keeps_six_decades(tmp_path):
     file.close()
     np.testing.assert_allclose(read_light(tmp_path / "a.exr").permute(1, 2, 0).numpy(), linear / 20, rtol=1e-6)
     Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
-    with pytest.raises(UnreadablePicture, match="expected linear light in floating-point numbers, .*, got uint8"):
+    with pytest.raises(UnreadablePicture, match=r"expected linear light in floating-point numbers, .*, got uint8"):
         read_light(tmp_path / "a.png")
 
 
