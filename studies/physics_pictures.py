@@ -337,8 +337,8 @@ def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:
 
 @drawn(9.0, 2.9)
 def light_figure(figure: Figure) -> None:
-    """Draw the sensitivity over light, the events of each pixel model, and the DoLP error of dimmed scenes."""
-    sensitivity, events, error = figure.subplots(1, 3)
+    """Draw the sensitivity over light, and the events of each pixel model."""
+    sensitivity, events = figure.subplots(1, 2)
     light = np.geomspace(255e-6, 255, 400).astype(np.float32)
     for (label, changes), colour in zip(
         {
@@ -360,12 +360,6 @@ def light_figure(figure: Figure) -> None:
     events.set(xlabel="brightest light, DN", ylabel="events per second", ylim=(0, 48))
     events.legend(fontsize=6, frameon=False, loc="upper left")
     events.set_title("a swing by e² once a second", loc="left", fontsize=9)
-    for (dark, by_light), colour in zip(results["dolp"]["mse"].items(), (*COLOURS[:3], ON), strict=True):
-        label = "v2e's response" if dark == "None" else f"dark_dn {float(dark):g}"
-        error.loglog([*map(float, by_light)], [*by_light.values()], "o-", color=colour, lw=1.4, ms=3, label=label)
-    error.set(xlabel="light of the scene, share", ylabel="MSE of DoLP")
-    error.legend(fontsize=7, frameon=False)
-    error.set_title("shipped network, generated scenes", loc="left", fontsize=9)
 
 
 FIGURES = {
