@@ -340,13 +340,11 @@ def light_figure(figure: Figure) -> None:
     """Draw the sensitivity over light, and the events of each pixel model."""
     sensitivity, events = figure.subplots(1, 2)
     light = np.geomspace(255e-6, 255, 400).astype(np.float32)
-    for (label, changes), colour in zip(
-        {
-            "knee_dn 20, v2e": {}, "knee_dn 2.72": {"knee_dn": 2.72}, "dark_dn 20": {"dark_dn": 20.0},
-            "dark_dn 5": {"dark_dn": 5.0}, "dark_dn 0.02": {"dark_dn": 0.02},
-        }.items(),
-        (*COLOURS, ON), strict=True,
-    ):  # fmt: skip
+    responses: dict[str, dict[str, Any]] = {
+        "knee_dn 20, v2e": {}, "knee_dn 2.72": {"knee_dn": 2.72}, "dark_dn 20": {"dark_dn": 20.0},
+        "dark_dn 5": {"dark_dn": 5.0}, "dark_dn 0.02": {"dark_dn": 0.02},
+    }  # fmt: skip
+    for (label, changes), colour in zip(responses.items(), (*COLOURS, ON), strict=True):
         physics, ends = physics_of(replace(QUIET, **changes)), np.empty((2, len(light)), np.float32)
         for factor, end in zip((0.95, 1.05), ends, strict=True):
             respond(light * np.float32(factor), physics, end)
