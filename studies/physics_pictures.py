@@ -3,6 +3,7 @@
 Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
 """
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,7 +25,8 @@ from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_o
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Pose, Sine, Trajectory, frame_times_us, render_poses
 from polarnet.simulation.moving_sensor import channel_light, emulate_motion
-from polarnet.simulation.pixels.light import KNEE, linlog
+from polarnet.simulation.pixels.light import KNEE, respond
+from polarnet.simulation.pixels.physics import physics_of
 from polarnet.simulation.presets import MOTIONS, POLARIZERS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.stokes import (
@@ -52,6 +54,11 @@ CONSTANT_SPEED_PX_S = 97.3
 FLAT_HEIGHT, FLAT_WIDTH = 40, 200
 SETTLING_FRAMES = 6  # until each pixel has fired, and its memory is that of an endless motion
 SIZE = (200, 300)  # rows and columns of the sensor behind the presets
+EVENT_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": COLOURS[0]}, {"color": COLOURS[2]}, {"color": COLOURS[3]}, {"color": ON},
+    {"color": COLOURS[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
+    {"color": LIGHT.quiet, "linestyle": "-."},
+)  # fmt: skip
 LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
 
 
@@ -65,7 +72,7 @@ def pixel_figure(figure: Figure) -> None:
 
 def _draw_response(axes: Axes) -> None:
     light, response = np.arange(256, dtype=np.float32), np.empty(256, np.float32)
-    linlog(light, response)
+    respond(light, physics_of(QUIET), response)
     axes.plot(light, response, **LINE)
     axes.axvline(KNEE, color=LIGHT.grid, linewidth=1, zorder=0)
     axes.annotate("logarithm", (90, float(response[90])), (95, 3.6), color=LIGHT.quiet, fontsize=8)
@@ -81,7 +88,7 @@ def _draw_photoreceptor(axes: Axes) -> None:
     for light_dn, colour in zip((200.0, 60.0, 15.0), COLOURS, strict=False):
         light = np.where(t_us < 5_000, light_dn / 1.25, light_dn)
         ends = np.empty(2, np.float32)
-        linlog(np.array([light_dn / 1.25, light_dn], np.float32), ends)
+        respond(np.array([light_dn / 1.25, light_dn], np.float32), physics_of(QUIET), ends)
         events = events_under(light, t_us, config)
         t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1] - ends[0])
         axes.step(np.r_[0, t_ms, 60], np.r_[0, rise, rise[-1:]], where="post", color=colour, linewidth=1.2)
@@ -328,6 +335,31 @@ def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:
     return dolp(stokes_from_intensities(intensities))
 
 
+@drawn(9.0, 2.9)
+def light_figure(figure: Figure) -> None:
+    """Draw the sensitivity over light, and the events of each pixel model."""
+    sensitivity, events = figure.subplots(1, 2)
+    light = np.geomspace(255e-6, 255, 400).astype(np.float32)
+    responses: dict[str, dict[str, Any]] = {
+        "knee_dn 20, v2e": {}, "knee_dn 2.72": {"knee_dn": 2.72}, "dark_dn 20": {"dark_dn": 20.0},
+        "dark_dn 5": {"dark_dn": 5.0}, "dark_dn 0.02": {"dark_dn": 0.02},
+    }  # fmt: skip
+    for (label, changes), colour in zip(responses.items(), (*COLOURS, ON), strict=True):
+        physics, ends = physics_of(replace(QUIET, **changes)), np.empty((2, len(light)), np.float32)
+        for factor, end in zip((0.95, 1.05), ends, strict=True):
+            respond(light * np.float32(factor), physics, end)
+        sensitivity.semilogx(light, (ends[1] - ends[0]) / math.log(1.05 / 0.95), color=colour, lw=1.4, label=label)
+    sensitivity.set(xlabel="light, DN", ylabel="response per ln light", ylim=(0, 3.2))
+    sensitivity.legend(fontsize=7, frameon=False, loc="upper left")
+    sensitivity.set_title("sensitivity", loc="left", fontsize=9)
+    results = json.loads((ROOT / "docs" / "results" / "light.json").read_text())
+    for (label, rates), style in zip(results["events"]["per_second"].items(), EVENT_STYLES, strict=True):
+        events.semilogx(results["events"]["levels_dn"], rates, linewidth=1.4, label=label, **style)
+    events.set(xlabel="brightest light, DN", ylabel="events per second", ylim=(0, 48))
+    events.legend(fontsize=6, frameon=False, loc="upper left")
+    events.set_title("a swing by e² once a second", loc="left", fontsize=9)
+
+
 FIGURES = {
     "theory_malus": malus_figure,
     "theory_gains": gains_figure,
@@ -335,6 +367,7 @@ FIGURES = {
     "physics_polarizers": polarizers_figure,
     "physics_readout": readout_figure,
     "physics_rate": rate_figure,
+    "physics_light": light_figure,
 }
 
 

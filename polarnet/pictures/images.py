@@ -200,6 +200,22 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
     return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
 
 
+def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
+    """Light of a picture in linear floating-point numbers (OpenEXR, Radiance HDR), as shares of the brightest value.
+
+    Nothing is clipped at white or encoded, so that the picture keeps its range; negative values become 0.
+    UnreadablePicture as `read_picture`, for other files, and for a picture without light.
+    """
+    picture = read_picture(path)
+    if picture.pixels.dtype != np.float32 or "lin" not in picture.colour_space or not picture.pixels.max() > 0:
+        raise UnreadablePicture(
+            f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} "
+            f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
+        )
+    light = np.clip(picture.pixels, 0, None) / picture.pixels.max()
+    return torch.from_numpy(np.ascontiguousarray(light.transpose(2, 0, 1)))
+
+
 def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
     """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
     kind = extension(path)

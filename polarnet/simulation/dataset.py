@@ -11,7 +11,7 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.simulation.camera import Camera, channel_size, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
@@ -91,7 +91,8 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:
     """The scene of a stored sequence, the motion over it, and its duration in microseconds."""
     stored = scenes.read(sequence)
-    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    dynamic_range = scenes.attributes.get("synthesize", {}).get("dynamic_range")
+    scene = stretched(scene_from_polarization(stored.s0, stored.dolp, stored.aolp), dynamic_range)
     return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
 
 

@@ -16,7 +16,7 @@ from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range,
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import Columns, empty_columns
+from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
 from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.ranges import RandomisedConfig
@@ -43,6 +43,7 @@ class PixelModel(Protocol):
     """A pixel model: a module of `polarnet.simulation.pixels`. `start` and `advance` are compiled kernels."""
 
     EIGHT_BIT_VIDEO: bool  # whether the model sees whole digital numbers at regular times
+    OPTIONS: tuple[str, ...]  # the names in `OFF` that the model has
 
     def physics_of(self, config: "EmulatorConfig") -> Any:
         """The model's parameters as a NamedTuple."""
@@ -57,6 +58,8 @@ class PixelModel(Protocol):
         """Advance the pixels through the steps, in place; return the columns with the events, and their number."""
 
 
+OFF = {"dark_dn": None, "photoreceptor_noise": 0.0, "refractory": "keep"}
+"""Values that switch off the parameters that only some models have; others refuse any other value."""
 MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_voltmeter": voltmeter}
 
 
@@ -64,7 +67,8 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A model ignores the parameters that it does not have. Ranges in `randomise` are drawn before (`Camera.drawn`).
+    A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
+    before (`Camera.drawn`).
 
     >>> from dataclasses import replace
     >>> from polarnet.simulation import SENSORS
@@ -75,6 +79,16 @@ class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, 
     model: Annotated[str, one_of(MODELS)]
     render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
+
+    def __post_init__(self):
+        esim.EsimConfig.__post_init__(self)
+        RandomisedConfig.__post_init__(self)
+        for name, off in OFF.items():
+            value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
+            if value != off and self.model not in having:
+                raise ValueError(
+                    f"{name}: expected {off} with model {self.model}, got {value}; models with it: {', '.join(having)}"
+                )
 
 
 @dataclass(frozen=True)
@@ -122,8 +136,8 @@ def emulate(
     fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
     clip. `key`, modulo 2^64, seeds all noise, which each channel draws by its number in `channels` (default: 0, 1,
     ...). Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels.
-    TypeError for anything but an array; ValueError for times that do not increase, values that are not finite or
-    outside 0..255, and sizes that do not fit.
+    TypeError for anything but an array; ValueError for times that `_checked_times` refuses, values that are not finite
+    or outside 0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -149,10 +163,13 @@ def emulate_frames(
     state: SensorState | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """As `emulate`, for times and light in DN that come in pieces; models of 8-bit video see it rounded."""
-    parts = []
+    """As `emulate`, for times and light in DN that come in pieces.
+
+    Models of 8-bit video see it rounded, unless `dark_dn` asks for light below 1 DN.
+    """
+    parts, sensor = [], channels.sensor
     for t_us, light in pieces:
-        if MODELS[channels.sensor.model].EIGHT_BIT_VIDEO:
+        if MODELS[sensor.model].EIGHT_BIT_VIDEO and sensor.dark_dn is None:
             light = (light + np.float32(0.5)).astype(np.uint8)
         lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
         events, state = emulate_lights(channels, lights, t_us.astype(np.float64), state, threads)
@@ -168,12 +185,15 @@ def emulate_lights(
     state: SensorState | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
+    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once.
+
+    ValueError for times that `_checked_times` refuses.
+    """
     forget_stale_code()
     numbers, height, width, config, key = channels
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key % 2**64)
-    times = t_us if state is None else np.concatenate([[state.t_us], t_us])
+    times = _checked_times(t_us if state is None else np.concatenate([[state.t_us], t_us]))
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
@@ -198,6 +218,27 @@ def emulate_lights(
     return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
 
 
+def _checked_times(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """The times of frames, the last one of the state before them included.
+
+    ValueError for NaN, times beyond 2^53 us, times that do not increase, and steps of more than 2^32 us (71 minutes).
+    """
+    wrong, steps = ~(np.abs(times) <= MAX_TIME_US), np.diff(times)
+    wrong[1:] |= ~(steps > 0)
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise ValueError(
+            f"emulate: expected strictly increasing times in us, of at most 2^53, got {times[max(k - 2, 0) : k + 1]}"
+        )
+    if len(steps) and steps.max() > MAX_STEP_US:
+        k = int(steps.argmax())
+        raise ValueError(
+            f"emulate: expected at most {MAX_STEP_US * 1e-6:.0f} s from one frame to the next, got {steps[k] * 1e-6:g} "
+            f"s after {times[k]} us; insert frames, or scale the times down"
+        )
+    return times
+
+
 def _check_frames(
     frames: Tensor, times: Float64[np.ndarray, " m"], channels: tuple[int, ...], state: SensorState | None, model: str
 ) -> None:
@@ -213,10 +254,6 @@ def _check_frames(
         check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
     if len(set(channels)) != frames.shape[1]:
         raise ValueError(f"emulate: expected {frames.shape[1]} different channel numbers, got {channels}")
-    before = times if state is None else np.concatenate([[state.t_us], times])
-    if not (np.isfinite(before).all() and (np.diff(before) > 0).all()):
-        after = "" if state is None else f", the first after the state's {state.t_us}"
-        raise ValueError(f"emulate: expected strictly increasing times in us{after}, got {times[:5].tolist()}...")
     if state is not None:
         theirs = f"model {state.model}, channels {state.channels} of {state.height}x{state.width} pixels"
         ours = f"model {model}, channels {channels} of {frames.shape[2]}x{frames.shape[3]} pixels"

@@ -49,6 +49,8 @@ class SynthesizeConfig:
     acceleration_max_px_s2: Annotated[float, Field(gt=0, le=1e9)]
     rotation_max_deg: Annotated[float, Field(ge=0, le=90)]
     zoom_max: Annotated[float, Field(ge=1, le=16)]
+    dynamic_range: Annotated[float, Field(gt=1, le=1e8)] | None
+    """Brightest over darkest light of a scene, to which `scene.stretched` stretches its S0; null: S0 as it is."""
 
     def __post_init__(self):
         if self.speed_max_px_s < self.speed_min_px_s:

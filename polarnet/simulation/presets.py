@@ -20,8 +20,12 @@ def _preset(group: str, name: str) -> dict[str, Any]:
 _PARAMS = YAML(typ="safe").load(shipped_settings() / "params.yaml")
 _SENSOR = EmulatorConfig(**_PARAMS["emulate"])
 
-SENSORS = {name: replace(_SENSOR, **_preset("sensor", name)) for name in ("default", "clean", "noisy", "random")}
-"""v2e's command-line defaults, its options `clean` and `noisy`, and `random`, which differs from sequence to sequence.
+SENSORS = {
+    name: replace(_SENSOR, **_preset("sensor", name))
+    for name in ("default", "clean", "noisy", "random", "davis346", "gen41", "celex5")
+}
+"""v2e's command-line defaults, its options `clean` and `noisy`, `random`, which differs from sequence to sequence, and
+three real cameras: DAVIS346, Prophesee Gen4.1 (Sony IMX636) and CeleX-5, with their sources in conf/sensor.
 
 Derive others with `dataclasses.replace`.
 

@@ -101,6 +101,24 @@ def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
     return scene_from_polarization(*polarization_from_rgb(rgb))
 
 
+def stretched(scene: PolarizationScene, dynamic_range: float | None) -> PolarizationScene:
+    """The scene with S0 replaced by dynamic_range^(S0 - 1), from 1 / dynamic_range to 1; DoLP and AoLP stay.
+
+    The code values of a photograph become the logarithm of its light. None returns the scene itself.
+
+    >>> import torch
+    >>> from polarnet.simulation.scene import scene_from_rgb, stretched
+    >>> stretched(scene_from_rgb(torch.full((3, 2, 2), 0.5)), 1e6).stokes[0, 0, 0]
+    tensor(0.0010)
+    """
+    if dynamic_range is None:
+        return scene
+    s0 = scene.stokes[0].double()
+    light = torch.exp((s0 - 1) * math.log(dynamic_range))
+    shares = torch.where(s0 > 0, scene.stokes[1:].double() / torch.where(s0 > 0, s0, 1.0), 0.0)
+    return PolarizationScene(torch.cat([light[None], shares * light]).float())
+
+
 def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationScene:
     """The scene measured behind polarizers at 0, 45, 90 and 135 degrees, in linear light, I0 + I90 at most 1.
 

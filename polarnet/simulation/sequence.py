@@ -13,7 +13,7 @@ from polarnet.simulation.camera import Camera, grid, pixel_analyzers
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb, stretched
 from polarnet.simulation.truth import frames_of
 
 
@@ -78,6 +78,7 @@ def simulate(
         raise TypeError(f"seed: expected a whole number, got {seed!r}")
     scene = picture if isinstance(picture, PolarizationScene) else scene_from_rgb(picture)
     check_scene(scene)
+    scene = stretched(scene, motion.dynamic_range)
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
     camera = (sensor if isinstance(sensor, Camera) else Camera(sensor)).drawn(seed, "picture")
     t_us, size = frame_times_us(motion), (motion.sensor_height, motion.sensor_width)

@@ -22,7 +22,7 @@ from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation import scene as scene_module
 from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, channel_size, grid, mixed_with_neighbours
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import Contents, FrameStore, Polarization
 from polarnet.storage.scenes import SceneStore, as_stored
@@ -171,7 +171,7 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
         planes = _planes_of(name, picture, synthesis)
         if not scenes.masked:
             planes = planes._replace(valid=None)
-        scene = scene_from_polarization(planes.s0, planes.dolp, planes.aolp)
+        scene = stretched(scene_from_polarization(planes.s0, planes.dolp, planes.aolp), config.dynamic_range)
         for sequence, *_, trajectory in over_scene:
             scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
             if planes.valid is not None:

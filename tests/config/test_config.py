@@ -51,7 +51,7 @@ def edit(project: Path, old: str, new: str) -> None:
         ("seed.x=1", r"seed\.x is not a setting; seed is a value, not a section"),
         ("emulate.contrast_threshold_sigma=0.05", r"did you mean contrast_threshold_sigma_on or contrast_"),
         ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photog"),
-        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has clean, default, noisy, random$"),
+        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has celex5, clean, .*, random$"),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
         ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),

@@ -19,6 +19,7 @@ from polarnet.pictures.images import (
     UnreadablePicture,
     fit,
     picture_extensions,
+    read_light,
     read_picture,
     read_rgb,
     srgb_of,
@@ -131,6 +132,18 @@ def test_linear_light_in_an_exr_is_encoded_as_srgb(tmp_path):
     file.close()
     rgb = read_rgb(tmp_path / "a.exr").permute(1, 2, 0).numpy()
     np.testing.assert_allclose(rgb, encode_srgb(linear), atol=1e-4)
+
+
+def test_light_of_an_exr_keeps_six_decades(tmp_path):
+    linear = np.geomspace(2e-5, 20, 1800, dtype=np.float32).reshape(20, 30, 3)
+    file = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+    file.open(str(tmp_path / "a.exr"), oiio.ImageSpec(30, 20, 3, "float"))
+    file.write_image(linear)
+    file.close()
+    np.testing.assert_allclose(read_light(tmp_path / "a.exr").permute(1, 2, 0).numpy(), linear / 20, rtol=1e-6)
+    Image.new("RGB", (30, 20)).save(tmp_path / "a.png")
+    with pytest.raises(UnreadablePicture, match=r"expected linear light in floating-point numbers, .*, got uint8"):
+        read_light(tmp_path / "a.png")
 
 
 def test_the_same_pixels_have_the_same_hash_in_every_format(tmp_path, rgb8):

@@ -109,6 +109,7 @@ def data(tmp_path_factory):
     motion = SynthesizeConfig(
         sequences_per_picture=1, duration_s=0.2, frame_rate_hz=30.0, sensor_height=24, sensor_width=36,
         speed_min_px_s=10.0, speed_max_px_s=20.0, acceleration_max_px_s2=800.0, rotation_max_deg=0.0, zoom_max=1.0,
+        dynamic_range=None,
     )  # fmt: skip
     synthesize(Synthesis(data / "images", motion, 1, 2), data / "scenes.zarr", data / "frames.zarr", map)
     frames = FrameStore.open(data / "frames.zarr")

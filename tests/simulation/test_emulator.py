@@ -10,7 +10,7 @@ from event_fixtures import equal
 from simulation_fixtures import QUIET, moving_bars
 
 from polarnet.events.stream import concatenate, validate
-from polarnet.simulation.emulator import MODELS, EmulatorConfig, emulate
+from polarnet.simulation.emulator import MODELS, Channels, EmulatorConfig, emulate, emulate_frames
 from polarnet.simulation.presets import SENSORS
 
 NOISY = dataclasses.replace(
@@ -170,6 +170,12 @@ def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
     [
         ({"model": "iebcs"}, "model: expected one of v2e, exact, esim, dvs_voltmeter"),
         ({"contrast_threshold_on": 0.0}, "contrast_threshold_on: expected >= 0.01"),
+        ({"knee_dn": 1.0}, "knee_dn: expected >= 2.72"),
+        ({"model": "esim", "dark_dn": 5.0}, r"dark_dn: expected None with model esim, got 5\.0; models .*: v2e, exact"),
+        (
+            {"dark_dn": 5.0, "randomise": {"model": ["exact", "esim"]}},
+            "randomise.dark_dn: expected None with model esim",
+        ),
     ],
 )
 def test_a_configuration_out_of_range_is_refused_by_name(changes, message):
@@ -201,7 +207,7 @@ def test_light_that_makes_no_sense_is_refused(unchecked_annotations, frames, t_u
 
 def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
     _, state = emulate(CLIP, TIMES, QUIET, key=1)
-    with pytest.raises(ValueError, match=r"the first after the state's 20\.0"):
+    with pytest.raises(ValueError, match=r"strictly increasing times .* got \[20\. +0\.\]"):
         emulate(CLIP, TIMES, QUIET, key=1, state=state)
     with pytest.raises(ValueError, match=r"expected a state of .* 3x5 pixels, got .* channels \(0, 1\) of 4x5 pixels"):
         emulate(CLIP[:, :, :3], TIMES + 100, QUIET, key=1, state=state)
@@ -235,3 +241,55 @@ def test_a_sensor_without_noise_fires_nothing_once_the_light_has_stopped_changin
     assert len(first) > 300
     assert first.t.max() <= 110_000
     assert equal(first, other)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_with_dark_dn_a_step_by_a_factor_fires_alike_over_six_decades_of_light(model):
+    """ln 3 is five thresholds of 0.2; v2e sees light below 1 DN then, also from pieces, which it rounds otherwise."""
+    level = 255e-6 * torch.tensor([1.0, 1e2, 1e4, 3e5])
+    frames, t_us = torch.stack([level, 3 * level]).view(2, 1, 1, 4), np.array([0, 10_000])
+    config = of(model, dark_dn=0.0)
+    (events,), _ = emulate(frames, t_us, config, key=1)
+    assert torch.bincount(events.x.long()).tolist() == [4, 5, 5, 5]  # dark counts as 0.0001 DN, beside 0.000255 DN
+    pieces = [(t_us, frames.numpy().transpose(1, 0, 2, 3))]
+    (again,), _ = emulate_frames(Channels((0,), 1, 4, config, 1), pieces)
+    assert equal(again, events)
+
+
+def test_a_pixel_held_in_reset_forgets_the_change_of_its_refractory_period():
+    """A ramp of 1.0 in 1 ms crosses 0.2 at 200 us, is forgotten until 700 us, and crosses again at 900 us."""
+    frames = log_ramp(4.0, 5.0, 1).repeat_interleave(torch.tensor([1, 2]), 0)
+    t_us = np.array([0.0, 1000.0, 5000.0])
+    for refractory, expected in (("keep", [199, 699, 1199, 1699]), ("reset", [199, 899])):
+        config = of("exact", refractory_period_us=500.0, refractory=refractory)
+        (events,), _ = emulate(frames, t_us, config, key=1)
+        assert events.t.tolist()[:4] == pytest.approx(expected, abs=1)
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 3000.0])
+def test_a_pixel_held_in_reset_fires_the_same_at_any_frame_rate(rate_hz):
+    """On an endless log ramp of 1.0 in 100 ms, an event every refractory period and the time of a threshold: 32 ms."""
+    t_us = np.arange(0, 300_001, 1e6 / rate_hz)
+    frames = np.exp(2.5 + t_us / 1e5).astype(np.float32).reshape(-1, 1, 1, 1)
+    config = of("exact", knee_dn=2.72, refractory_period_us=12_000.0, refractory="reset")
+    (events,), _ = emulate(frames, t_us, config, key=1)
+    assert events.t.tolist() == pytest.approx(20_000 + 32_000 * np.arange(9), abs=20)
+
+
+def test_a_leak_of_a_pixel_held_in_reset_starts_anew_after_each_period():
+    config = of("exact", leak_rate_hz=10.0, refractory_period_us=150_000.0, refractory="reset")
+    (events,), _ = emulate(torch.full((101, 1, 1, 1), 90.0), 100_000 * np.arange(101), config, key=1)
+    assert events.t.diff().tolist() == pytest.approx([250_000] * (len(events) - 1), abs=2)
+
+
+@pytest.mark.parametrize("name", ["davis346", "gen41", "celex5"])
+def test_presets_of_real_cameras_fire_signal_and_noise_over_six_decades(name):
+    """Their thresholds are crossed as often at 1 DN as at 100 DN, and rarely at a thousandth of their dark current."""
+    t_us = 1000.0 * np.arange(1001)
+    swing = np.exp(np.sin(2 * math.pi * t_us / 1e6 - math.pi / 2))
+    levels = np.array([1e-4, 1.0, 90.0]).repeat(400)
+    frames = np.minimum(swing[:, None] * levels, 255).astype(np.float32).reshape(-1, 1, 1, 1200)
+    (events,), _ = emulate(frames, t_us, SENSORS[name], key=1)
+    dark, dim, bright = torch.bincount(events.x.long() // 400, minlength=3).tolist()
+    assert dim == pytest.approx(bright, rel=0.15)
+    assert 0 < dark < 0.2 * dim

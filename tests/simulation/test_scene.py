@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from polarnet.simulation.scene import (
+    check_scene,
     polarization_from_rgb,
     scene_from_intensities,
     scene_from_polarization,
     scene_from_rgb,
+    stretched,
 )
 from polarnet.stokes import aolp, dolp, intensities_from_stokes, intensity_behind_polarizer
 
@@ -88,3 +90,12 @@ def test_degrees_percentages_and_bytes_are_no_polarization(s0, dolp, aolp, messa
         scene_from_polarization(*(torch.full((2, 2), value) for value in (s0, dolp, aolp)))
     with pytest.raises(ValueError, match=r"expected S0 = I0 \+ I90 in \[0, 1\], got values up to 1\.6"):
         scene_from_intensities(torch.full((4, 2, 2), 0.8))
+
+
+def test_a_stretched_scene_has_its_dynamic_range_and_the_same_polarization():
+    s0, degree = torch.tensor([[0.0, 0.5, 1.0]]), torch.full((1, 3), 0.4)
+    scene = stretched(scene_from_polarization(s0, degree, torch.full((1, 3), 0.6)), 1e6)
+    assert scene.stokes[0, 0].tolist() == pytest.approx([1e-6, 1e-3, 1], rel=1e-5)
+    assert dolp(scene.stokes)[0].tolist() == pytest.approx([0, 0.4, 0.4], abs=1e-6)  # black has no polarization
+    assert aolp(scene.stokes)[0, 1:].tolist() == pytest.approx([0.6, 0.6], abs=1e-6)
+    check_scene(scene)

@@ -14,6 +14,8 @@ from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 
 TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, PLACE_MASK = np.int64(31), np.int64(16), np.int64(1), np.int64(0x7FFF)
+MAX_STEP_US = (1 << 32) - 4  # room of `event_of`, less what rounding to whole microseconds adds
+MAX_TIME_US = 1 << 53  # larger whole numbers do not all fit float64
 EVENT_BYTES = 8 + 2 + 2 + 1
 SPAN_US = 1 << 16  # span of time whose events a hot pixel draws independently of other spans
 MAX_BUCKETS = 4096  # buckets of the counting sort; a step shorter than 4096 us has one bucket per microsecond

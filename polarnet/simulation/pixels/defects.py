@@ -12,10 +12,10 @@ from pydantic import Field
 from polarnet.runtime.sections import section
 from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 
 Share = Annotated[float, Field(ge=0, le=1)]
-MAX_RATE_HZ = 1e5  # a pixel's refractory period allows no more
 
 
 @section

@@ -17,6 +17,7 @@ from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.physics import PixelConfig
 
 EIGHT_BIT_VIDEO = False
+OPTIONS: tuple[str, ...] = ()
 NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
 NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test; `_levels` then counts exactly
 

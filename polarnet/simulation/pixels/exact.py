@@ -16,7 +16,7 @@ from polarnet.simulation.pixels import active as strips
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import SPARE, empty_active, flagged, gather, keep_continuing, scatter
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import intensity_rows, linlog
+from polarnet.simulation.pixels.light import intensity_rows, respond
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,
@@ -24,12 +24,15 @@ from polarnet.simulation.pixels.physics import (
     Physics,
     mismatch,
     shot_noise_fraction,
+    wander,
 )
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
 
 EIGHT_BIT_VIDEO = False
+OPTIONS: tuple[str, ...] = ("dark_dn", "photoreceptor_noise", "refractory")
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
+EPSILON = 2.0**-52
 BATCH = 2000  # minimum number of active pixels that are followed in one pass, except for the last strip
 LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
@@ -44,10 +47,11 @@ class Pixels(NamedTuple):
 
     change: np.ndarray  # filtered log intensity since the last event, leak included
     dn: np.ndarray  # light of the last frame, DN
-    linlog: np.ndarray  # response to that light: linear up to 20 DN, logarithmic above
+    response: np.ndarray  # response to that light
     lag: np.ndarray  # output of the photoreceptor minus response
     buffer_lag: np.ndarray
     """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
+    noise: np.ndarray  # of the photoreceptor, natural-log intensity; empty without it
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_nominal: np.ndarray  # log intensity per microsecond, frozen per pixel
@@ -65,6 +69,7 @@ class Step(NamedTuple):
     stop_us: float
     duration_us: float
     refractory_us: float
+    held_us: float  # the refractory period if the pixel is held in reset for it, else 0
     jitter: float  # relative standard deviation of the leak; 0 where nothing leaks
     leak_key: np.uint64
     shot_key: np.uint64
@@ -79,6 +84,7 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
     return Pixels(
         change, dn, response, lag,
         np.zeros(n if physics.source_follower_hz > 0 else 0, np.float32),
+        np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32),
         threshold_on, threshold_off,
         np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
         leak,
@@ -91,7 +97,7 @@ def start(light, pixels, steps):
     """Adapt the pixels to the first frame, and draw each pixel's phase of the leak and first shot-noise candidate."""
     physics, time_us = steps.physics, steps.times_us[0]
     intensity_rows(light, ZERO, ZERO, steps.width, pixels.dn)
-    linlog(pixels.dn, pixels.linlog)
+    respond(pixels.dn, physics, pixels.response)
     phase_key = key_for(steps.key, randomness.LEAK_PHASE, steps.channel)
     jitter_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
@@ -115,6 +121,7 @@ def advance(light, pixels, steps, columns):
     active = empty_active(BATCH + rows * w + SPARE)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
+    noise_key = key_for(steps.key, randomness.PHOTORECEPTOR, steps.channel)
     jitter = physics.leak_jitter if physics.leak_rate_hz > 0 else 0.0
     pending = np.empty(h * w, np.int64)
     soonest_us = np.array([pixels.next_shot_us[y * w : (y + rows) * w].min() for y in range(0, h, rows)])
@@ -122,15 +129,16 @@ def advance(light, pixels, steps, columns):
     for k in range(times_us.size - 1):
         start_us, stop_us, dt_us = times_us[k], times_us[k + 1], times_us[k + 1] - times_us[k]
         has_shots, refractory_us = soonest_us.min() < stop_us, physics.refractory_s * 1e6
-        step = Step(physics, start_us, stop_us, dt_us, refractory_us, jitter, leak_key, shot_key, has_shots)
+        held_us = refractory_us if physics.holds else 0.0
+        step = Step(physics, start_us, stop_us, dt_us, refractory_us, held_us, jitter, leak_key, shot_key, has_shots)
         n, count = ZERO, ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
             rise, before = strip[2, : stop - first], strip[3, : stop - first]
-            dn_before, response_before = pixels.dn[first:stop], pixels.linlog[first:stop]
+            dn_before, response_before = pixels.dn[first:stop], pixels.response[first:stop]
             intensity_rows(light, steps.first_frame + k, y, w, dn)
-            linlog(dn, response)
+            respond(dn, physics, response)
             if physics.cutoff_hz > 0:
                 rate = np.float32(2e-6 * math.pi * physics.cutoff_hz * dt_us / SATURATION)
                 _filter(dn, response, dn_before, response_before, pixels.lag[first:stop], rate, rise)
@@ -138,6 +146,11 @@ def advance(light, pixels, steps, columns):
                 _difference(dn, response, dn_before, response_before, rise)
             if physics.source_follower_hz > 0:
                 _buffer(rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * dt_us)
+            if physics.photoreceptor_noise > 0:
+                key = mixed(noise_key, steps.first_number + k)
+                wander(pixels.noise[first:stop], key, first, physics, dt_us * 1e-6, rise)
+            if held_us > 0:
+                _hold(pixels.last_event_us[first:stop], pixels.leak[first:stop], step, rise)
             fires = strips.flags_of(words, stop - first)
             _move(pixels, first, rise, np.float32(dt_us), before, fires)
             if soonest_us[y // rows] < stop_us:
@@ -202,6 +215,17 @@ def _buffer(rise, lag, a):
 
 
 @borrowing
+def _hold(last_event_us, leak, step, rise):
+    """Take from each rise, and from the leak that `_move` adds to it, the part of the step that the pixel is held."""
+    dt_us = np.float32(step.duration_us)
+    for j in range(rise.size):
+        held = np.float32(max(last_event_us[j] + step.held_us - step.start_us, 0.0) / step.duration_us)
+        if held > 0:
+            held = min(held, np.float32(1))
+            rise[j] -= held * (rise[j] + leak[j] * dt_us)
+
+
+@borrowing
 def _move(pixels, first, rise, dt_us, before, fires):
     """Advance each change by its rise and leak as if nothing fired; flag pixels beyond a threshold at either end."""
     strip = slice(first, first + rise.size)
@@ -244,6 +268,11 @@ def _activate(pixels, first, before, rise, words, step, active, count):
         active.slope[a] *= per_us
         active.last_event[a] -= step.start_us
         active.now[a] = 0.0
+        if step.held_us > 0:
+            active.now[a] = min(max(active.last_event[a] + step.held_us, 0.0), step.duration_us)
+            free = 1 - active.now[a] * per_us
+            # undo `_hold`: the slope is that of the light alone
+            active.slope[a] = (active.slope[a] + active.leak[a] * (1 - free)) / free if free > 0 else 0.0
     return stop
 
 
@@ -264,25 +293,27 @@ def _fire(pixels, step, active, count, width, pending, n):
 @borrowing
 def _fire_once(pixels, step, active, count, width, pending, n):
     """Run one round of `_fire`; return the numbers of pending events and of pixels that may fire in the next round."""
-    _next_crossing(active, count, step.refractory_us, step.duration_us)
+    _next_crossing(active, count, step)
     active.continues[:count] = 0
     if step.has_shots:
         _insert_shots(pixels, step, active, count)
-    _move_on(active, count, step.jitter, step.leak_key, step.duration_us)
+    _move_on(active, count, step)
     n = _append_events(active, count, width, step.start_us, pending, n)
     _store_state(pixels, active, count, step.start_us)
     return n, keep_continuing(active, count)
 
 
 @inlined
-def _next_crossing(active, count, refractory_us, duration_us):
+def _next_crossing(active, count, step):
     """Find when each pixel next fires, and its change right after."""
+    refractory_us, duration_us = step.refractory_us, step.duration_us
+    kept = 0.0 if step.held_us > 0 else 1.0
     for a in range(count):
         threshold_on, threshold_off = np.float64(active.threshold_on[a]), np.float64(active.threshold_off[a])
         leak, change, now, last = np.float64(active.leak[a]), active.change[a], active.now[a], active.last_event[a]
         slope = active.slope[a] + leak
         ready = max(now, last + refractory_us)
-        at_ready = change + slope * (ready - now)
+        at_ready = change + kept * slope * (ready - now)
         on = (at_ready >= threshold_on) | ((at_ready > -threshold_off) & (slope > 0))
         over, under = at_ready - threshold_on, -threshold_off - at_ready
         excess = over if on else under
@@ -317,8 +348,9 @@ def _insert_shots(pixels, step, active, count):
 
 
 @inlined
-def _move_on(active, count, jitter, key, duration_us):
+def _move_on(active, count, step):
     """Draw a new leak after each event, and find which pixels may fire again."""
+    jitter, key, duration_us = step.jitter, step.leak_key, step.duration_us
     pixel, events, leak_nominal = active.pixel[:count], active.events[:count], active.leak_nominal[:count]
     leak, last_event, fires = active.leak[:count], active.last_event[:count], active.fires[:count]
     for a in range(count):
@@ -329,7 +361,8 @@ def _move_on(active, count, jitter, key, duration_us):
     for a in range(count):
         change, now = active.next_change[a], active.next_now[a]
         last_event[a] = now if fires[a] else last_event[a]
-        final = change + (active.slope[a] + leak[a]) * (duration_us - now)
+        free_us = max(duration_us - now - step.held_us * fires[a], 0.0)
+        final = change + (active.slope[a] + leak[a]) * free_us
         beyond = (max(change, final) >= active.threshold_on[a]) | (min(change, final) <= -active.threshold_off[a])
         active.final_change[a] = final
         active.continues[a] |= fires[a] & beyond
@@ -376,10 +409,13 @@ def _jittered_leak(nominal, jitter, key, i, number):
 
 @compiled
 def _until_next_shot(physics, key, i, time_us, threshold_on, threshold_off):
-    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark."""
+    """Microseconds to the next event of a Poisson process with the pixel's shot-noise rate in the dark.
+
+    Never less than float64 resolves at that time: the next draw of the pixel would be the same one.
+    """
     share = physics.threshold_on / threshold_on + physics.threshold_off / threshold_off
     rate_hz = physics.shot_noise_rate_hz / 2 * DARK_SHOT_NOISE * share
-    return -1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz
+    return max(-1e6 * math.log(uniform(_bits(key, i, time_us))) / rate_hz, abs(time_us) * EPSILON)
 
 
 @compiled

@@ -1,17 +1,18 @@
-"""Light on the pixels of one channel in digital numbers (DN, 255: a picture's brightest value), and the response."""
+"""Light on the pixels of one channel in digital numbers (DN, 255: a picture's brightest value), and the response.
+
+The response is v2e's, ln(DN) above a knee and linear below, or with `dark_dn` the smooth ln(DN + dark_dn).
+"""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, inlined
+from polarnet.simulation.compilation import borrowing, compiled, inlined
 
 FULL_SCALE = 255.0  # DN
 KNEE = 20.0  # DN below which v2e's response is linear
-LINLOG_TABLE = np.array(
-    [round(i * math.log(KNEE) / KNEE if i <= KNEE else math.log(i), 8) for i in range(256)], dtype=np.float32
-)
+MIN_DARK_DN = 1e-4  # keeps the logarithm of no light finite
 
 
 class Light(NamedTuple):
@@ -57,21 +58,30 @@ def _bilinear_row(images, row, column, dn):
 
 
 @borrowing
-def linlog_8bit(dn, linlog):
-    """v2e's response to 8-bit light: rounds `dn` to whole numbers in place, then looks the response up."""
+def respond_8bit(dn, table, response):
+    """Response to 8-bit light: rounds `dn` to whole numbers in place, then looks them up in `table_of_response`."""
     for j in range(dn.size):
         whole = np.int32(dn[j] + np.float32(0.5)) & np.int32(255)
         dn[j] = np.float32(whole)
-        linlog[j] = LINLOG_TABLE[whole]
+        response[j] = table[whole]
+
+
+@compiled
+def table_of_response(physics):
+    """Response to 0 to 255 DN."""
+    table = np.empty(256, np.float32)
+    respond_as_v2e(np.arange(256).astype(np.float32), physics, table)
+    return table
 
 
 @borrowing
-def linlog_as_v2e(dn, linlog):
-    """v2e's response to any DN >= 0, rounded as v2e rounds it: ln(DN) above 20, linear below, computed in float64."""
+def respond_as_v2e(dn, physics, response):
+    """Response to any DN >= 0, computed in float64 and rounded as v2e rounds it."""
+    knee, slope, dark = physics.knee_dn, physics.knee_slope, physics.dark_dn
     for j in range(dn.size):
         value = np.float64(dn[j])
-        response = value * (math.log(KNEE) / KNEE) if value <= KNEE else math.log(value)
-        linlog[j] = np.float32(np.rint(response * 1e8) / 1e8)
+        exact = value * slope if value <= knee else math.log(value + dark)
+        response[j] = np.float32(np.rint(exact * 1e8) / 1e8)
 
 
 # ln(1 + x) = x - x^2 / 2 + x^3 P(x) for 1 + x in [sqrt(1/2), sqrt(2)], and ln 2 in two parts (Cephes' logf); P is
@@ -82,7 +92,6 @@ LOG_POLYNOMIAL = tuple(map(np.float32, (
 )))  # fmt: skip
 LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 SQRT_HALF_BITS, MANTISSA_BITS = np.int32(0x3F3504F3), np.int32(23)
-KNEE_32, SLOPE_32 = np.float32(KNEE), np.float32(math.log(KNEE) / KNEE)
 
 
 @inlined
@@ -100,8 +109,9 @@ def ln(x):
 
 
 @borrowing
-def linlog(dn, response):
-    """v2e's response to any DN >= 0, in float32 throughout."""
+def respond(dn, physics, response):
+    """Response to any DN >= 0, in float32 throughout."""
+    knee, slope, dark = np.float32(physics.knee_dn), np.float32(physics.knee_slope), np.float32(physics.dark_dn)
     for j in range(dn.size):
-        logarithm = ln(max(dn[j], KNEE_32))
-        response[j] = logarithm if dn[j] > KNEE_32 else dn[j] * SLOPE_32
+        logarithm = ln(max(dn[j] + dark, knee))
+        response[j] = logarithm if dn[j] > knee else dn[j] * slope

@@ -13,11 +13,12 @@ from polarnet.simulation.compilation import ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import SPARE, flag_words, flagged, flags_of, rows_of_strip
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import intensity_rows, linlog_8bit, linlog_as_v2e
-from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, Physics, mismatch, shot_noise_fraction
+from polarnet.simulation.pixels.light import intensity_rows, respond_8bit, respond_as_v2e, table_of_response
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, Physics, mismatch, shot_noise_fraction, wander
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals, uniform
 
 EIGHT_BIT_VIDEO = True
+OPTIONS: tuple[str, ...] = ("dark_dn", "photoreceptor_noise")
 NEARLY = np.float32(1.000001)  # enlarges changes by more than rounding in a first test; `_count` then counts exactly
 
 physics_of = physics.physics_of
@@ -30,6 +31,7 @@ class Pixels(NamedTuple):
     filtered: np.ndarray
     """Log intensity behind the low-passes of photoreceptor and source follower; float64 with a low-pass."""
     photoreceptor: np.ndarray  # float64, log intensity between the two; empty without a source follower
+    noise: np.ndarray  # of the photoreceptor, natural-log intensity; empty without it
     threshold_on: np.ndarray
     threshold_off: np.ndarray
     leak_factor: np.ndarray  # leak rate relative to the nominal rate, frozen per pixel
@@ -56,38 +58,43 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
     threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
     photoreceptor = np.zeros(n if physics.source_follower_hz > 0 else 0)
     since = np.full(n, -physics.refractory_s, np.float32)
-    return Pixels(np.zeros(n, real), np.zeros(n, real), photoreceptor, threshold_on, threshold_off, leak_factor, since)
+    noise = np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32)
+    memory, filtered = np.zeros((2, n), real)
+    return Pixels(memory, filtered, photoreceptor, noise, threshold_on, threshold_off, leak_factor, since)
 
 
 @borrowing
-def _respond(light, frame, y, w, dn, linlog):
+def _respond(light, frame, y, w, physics, table, dn, response):
     intensity_rows(light, frame, y, w, dn)
-    if light.images.itemsize == 1 or light.top.size:  # bytes, or a scene that an 8-bit video shows
-        linlog_8bit(dn, linlog)
+    if light.images.itemsize == 1 or (light.top.size and physics.dark_dn == 0):  # a scene that an 8-bit video shows
+        respond_8bit(dn, table, response)
     else:
-        linlog_as_v2e(dn, linlog)
+        respond_as_v2e(dn, physics, response)
 
 
 @compiled
 def start(light, pixels, steps):
     """Set low-pass and memory to the first frame; nothing fires."""
-    dn, linlog = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
-    _respond(light, ZERO, ZERO, steps.width, dn, linlog)
-    pixels.filtered[:] = pixels.memory[:] = linlog
+    dn, response = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
+    _respond(light, ZERO, ZERO, steps.width, steps.physics, table_of_response(steps.physics), dn, response)
+    pixels.filtered[:] = pixels.memory[:] = response
     if pixels.photoreceptor.size:
-        pixels.photoreceptor[:] = linlog
+        pixels.photoreceptor[:] = response
+    pixels.refractory_since[:] += np.float32(min(steps.times_us[0], 0.0) * 1e-6)
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, w, size = steps.physics, steps.times_us, steps.width, steps.height * steps.width
-    (dn, linlog), noise = np.empty((2, w), np.float32), np.empty(size, np.float32)
-    words, (candidates, groups) = flag_words(w), np.empty((2, w + SPARE), np.int32)
+    (dn, response), noise = np.empty((2, w), np.float32), np.empty(size, np.float32)
+    table, words, (candidates, groups) = table_of_response(physics), flag_words(w), np.empty((2, w + SPARE), np.int32)
     firing, crossed = np.empty((2, size + 1), np.int32)
     pending = np.empty(size, np.int64)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
+    noise_key = key_for(steps.key, randomness.PHOTORECEPTOR, steps.channel)
+    output = np.empty_like(pixels.filtered) if physics.photoreceptor_noise > 0 else pixels.filtered
     max_share = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
     used = ZERO
     for k in range(times_us.size - 1):
@@ -103,37 +110,40 @@ def advance(light, pixels, steps, columns):
         for y in range(steps.height):
             row = slice(y * w, (y + 1) * w)
             filtered, memory = pixels.filtered[row], pixels.memory[row]
-            _respond(light, frame, y, w, dn, linlog)
+            _respond(light, frame, y, w, physics, table, dn, response)
             if physics.source_follower_hz > 0:
                 photoreceptor = pixels.photoreceptor[row]
                 if physics.cutoff_hz > 0:
-                    _filter(linlog, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
+                    _filter(response, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
                 else:
-                    photoreceptor[:] = linlog
+                    photoreceptor[:] = response
                 _buffer(photoreceptor, filtered, min(1.0, 2 * math.pi * physics.source_follower_hz * dt))
             elif physics.cutoff_hz > 0:
-                _filter(linlog, dn, filtered, 2 * math.pi * physics.cutoff_hz * dt)
+                _filter(response, dn, filtered, 2 * math.pi * physics.cutoff_hz * dt)
             else:
-                filtered[:] = linlog
+                filtered[:] = response
+            if physics.photoreceptor_noise > 0:
+                wander(pixels.noise[row], mixed(noise_key, number), y * w, physics, dt, response)
+                output[row] = filtered + pixels.noise[row]
             if physics.leak_rate_hz > 0:
                 _leak(memory, pixels.threshold_on[row], pixels.leak_factor[row], noise[row], dt, physics)
-            _flag(filtered, memory, pixels.threshold_on[row], pixels.threshold_off[row], flags_of(words, w))
+            _flag(output[row], memory, pixels.threshold_on[row], pixels.threshold_off[row], flags_of(words, w))
             count = flagged(words, w, candidates, groups)
-            n, most = _count(pixels, physics, y * w, candidates[:count], firing, crossed, n, most)
+            n, most = _count(pixels, output, physics, y * w, candidates[:count], firing, crossed, n, most)
         pending, n = _emit(pixels, step, w, firing[:n], crossed, most, pending)
         if physics.shot_noise_rate_hz > 0:
-            pending, n = _emit_shots(light, frame, pixels, step, w, pending, n)
+            pending, n = _emit_shots(light, frame, pixels, output, step, w, pending, n)
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 
 @borrowing
-def _filter(linlog, dn, filtered, rate):
+def _filter(response, dn, filtered, rate):
     """First-order low-pass whose bandwidth grows with light: rate = 2 pi cutoff dt at full brightness."""
     per_dn = rate / SATURATION
     for j in range(dn.size):
         share = min(1.0, (np.float64(dn[j]) + DARK_OFFSET) * per_dn)
-        filtered[j] += share * (linlog[j] - filtered[j])
+        filtered[j] += share * (response[j] - filtered[j])
 
 
 @borrowing
@@ -160,7 +170,7 @@ def _flag(filtered, memory, threshold_on, threshold_off, fires):
 
 
 @borrowing
-def _count(pixels, physics, first, candidates, firing, crossed, n, most):
+def _count(pixels, output, physics, first, candidates, firing, crossed, n, most):
     """List the candidates of the row from pixel `first` on that cross thresholds, and how many (negative for OFF).
 
     `n` is the length of the list, `most` the largest number of crossings so far; returns both.
@@ -168,11 +178,11 @@ def _count(pixels, physics, first, candidates, firing, crossed, n, most):
     double = pixels.memory.itemsize == 8  # v2e divides float64 by a Python float where all pixels have one threshold
     for x in candidates:
         i = first + x
-        change = np.float64(pixels.filtered[i] - pixels.memory[i])
+        change = np.float64(output[i] - pixels.memory[i])
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
-        if double and physics.threshold_sigma_on == 0:
+        if double and physics.threshold_sigma_on == 0 and physics.threshold_mismatch_on == 0:
             on = physics.threshold_on
-        if double and physics.threshold_sigma_off == 0:
+        if double and physics.threshold_sigma_off == 0 and physics.threshold_mismatch_off == 0:
             off = physics.threshold_off
         firing[n], crossed[n] = i, np.int32(change / (on if change > 0 else off))
         most = max(most, abs(crossed[n]))
@@ -224,7 +234,7 @@ def _slots(start_us, stop_us, most):
 
 
 @compiled
-def _emit_shots(light, frame, pixels, step, w, pending, n):
+def _emit_shots(light, frame, pixels, output, step, w, pending, n):
     """Append the shot noise of one step to the n pending events: each pixel's probability to fire falls with light.
 
     Geometric skipping finds the pixels that would fire in the dark at the channel's lowest thresholds. The draw
@@ -254,6 +264,6 @@ def _emit_shots(light, frame, pixels, step, w, pending, n):
         if n == pending.size:
             pending = roomier(pending)
         pending[n] = event_of(offset_us, place_of(row, i - row * w), u < on)
-        pixels.memory[i] = pixels.filtered[i]
+        pixels.memory[i] = output[i]
         n += 1
     return pending, n

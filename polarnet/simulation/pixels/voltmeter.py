@@ -16,6 +16,7 @@ from polarnet.simulation.pixels.light import intensity_rows
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
+OPTIONS: tuple[str, ...] = ()
 DRAWS = 3  # random numbers for the way from one event to the next
 
 
