@@ -141,8 +141,11 @@ def prepare(run_folder: Path, scratch: Path) -> None:
 
 
 def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
-    """Outcomes of each two commands: the second waited, one refused, or one of the failures of `studies.faults`."""
-    both = [*itertools.combinations_with_replacement(COMMANDS, 2)]
+    """Outcomes of each two commands: the second waited, one refused, or one of the failures of `studies.faults`.
+
+    A trial is paired with itself alone: no other command writes into the folder of a sweep.
+    """
+    both = [pair for pair in itertools.combinations_with_replacement(COMMANDS, 2) if pair.count("trial") != 1]
     counts = {
         f"{one} and {other} at once": dict.fromkeys(("waited", "refused", "unnamed", "traceback", "lost", "stuck"), 0)
         for one, other in both
