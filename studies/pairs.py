@@ -212,7 +212,3 @@ def outcome(
     if not all(PLACE in text or "ours" in text for text in refusals):
         return "unnamed", message
     return ("refused" if refusals else "waited"), message
-
-
-if __name__ == "__main__":
-    print(pairs(Path(sys.argv[1]).resolve(), int(sys.argv[2])))

@@ -37,8 +37,8 @@ from polarnet.events.streaming import encode_windows
 from polarnet.networks.polarnet.panorama import displacements
 from polarnet.networks.weights import shipped_weights
 from polarnet.simulation.compilation import compiled
-from studies.robustness import OURS, simulated, warmup_windows
-from studies.scored_pictures import ingested, part_of, scenes_of, settings, sources_of
+from studies.robustness import OURS, conditions_of, simulated, warmup_windows
+from studies.scored_pictures import ingested, scenes_of, settings
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 THRESHOLD = 0.2  # change of natural-log intensity per event
@@ -49,7 +49,7 @@ REACH = 12  # pixels per window of the motion search
 MARGIN = 4  # pixels round the panorama, for corrections of the motion
 ROUNDS = (20, 10, 10, 10, 10)  # conjugate-gradient iterations on 2x2 blocks; the motion is corrected between them
 LAST_ITERATIONS = 25  # on all pixels
-LARGEST_MOVE = 1.0  # limit in pixels of one correction of the motion
+MAX_MOVE = 1.0  # limit in pixels of one correction of the motion
 BLOCKS_MISMATCH, BLOCKS_ROUNDING = 0.6, 0.5  # of 2x2 blocks, relative to single pixels
 MAX_S = 0.98
 FLOOR = 1e-3
@@ -65,12 +65,6 @@ class Panorama(NamedTuple):
     y: Float64[np.ndarray, " k"]
 
 
-class Weights(NamedTuple):
-    """What is known of each pixel: subtract from its series the parts along three orthonormal ones, shrunk."""
-
-    series: Float32[np.ndarray, "4 3 k h w"]
-
-
 def register(counts: Float32[np.ndarray, "4 2 k h w"]) -> Panorama:
     """The panorama of a recording, from the numbers of ON and OFF events of each pixel and window."""
     events = np.zeros((4, 2, counts.shape[2] + 1, *counts.shape[3:]), np.float32)
@@ -80,17 +74,17 @@ def register(counts: Float32[np.ndarray, "4 2 k h w"]) -> Panorama:
     size = _even(y.max() + height + 1 + MARGIN), _even(x.max() + width + 1 + MARGIN)
     blocks = events[..., : height // 2 * 2, : width // 2 * 2]
     blocks = blocks.reshape(*events.shape[:3], height // 2, 2, width // 2, 2).mean((4, 6), dtype=np.float32)
-    coarse, coarse_size = np.zeros((4, size[0] // 2 + 1, size[1] // 2 + 1), np.float32), (size[0] // 2, size[1] // 2)
-    weights = _weights(blocks, BLOCKS_MISMATCH * MISMATCH, BLOCKS_ROUNDING * ROUNDING)
+    coarse = np.zeros((4, size[0] // 2 + 1, size[1] // 2 + 1), np.float32)
+    series = _weights(blocks, BLOCKS_MISMATCH * MISMATCH, BLOCKS_ROUNDING * ROUNDING)
     for number, iterations in enumerate(ROUNDS):
-        coarse = _solved(blocks, weights, x / 2, y / 2, coarse, iterations, BLOCKS_ROUNDING * ROUNDING)
+        coarse = _solved(blocks, series, x / 2, y / 2, coarse, iterations, BLOCKS_ROUNDING * ROUNDING)
         if number < len(ROUNDS) - 1:
-            dx, dy = _corrections(coarse, blocks, weights, x / 2, y / 2)
+            dx, dy = _corrections(coarse, blocks, series, x / 2, y / 2)
             x = np.clip(x + 2 * dx, 0, size[1] - width - 1.01)
             y = np.clip(y + 2 * dy, 0, size[0] - height - 1.01)
-    start = F.interpolate(torch.from_numpy(coarse)[None, :, : coarse_size[0], : coarse_size[1]], size, mode="bilinear")
-    weights = _weights(events, MISMATCH, ROUNDING)
-    images = _solved(events, weights, x, y, np.ascontiguousarray(start[0].numpy()), LAST_ITERATIONS, ROUNDING)
+    start = F.interpolate(torch.from_numpy(coarse)[None, :, :-1, :-1], size, mode="bilinear")
+    series = _weights(events, MISMATCH, ROUNDING)
+    images = _solved(events, series, x, y, np.ascontiguousarray(start[0].numpy()), LAST_ITERATIONS, ROUNDING)
     return Panorama(images, _coverage(x, y, (height, width), size) > 0.5, x, y)
 
 
@@ -122,8 +116,8 @@ def _even(length: float) -> int:
     return 2 * int(np.ceil(length / 2))
 
 
-def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Weights:
-    """The inverse covariance of each pixel's series is (1 - series series^T) / noise."""
+def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Float32[np.ndarray, "c 3 k h w"]:
+    """Orthonormal series of each pixel, shrunk: their parts are subtracted (`_weigh`), as the inverse covariance asks."""
     steps = THRESHOLD * events
     series = np.stack([np.ones_like(steps[:, 0]), steps[:, 0], steps[:, 1]], axis=1)
     gram = np.einsum("cmkij,cnkij->cijmn", series, series, optimize=True).astype(np.float64)
@@ -131,7 +125,7 @@ def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Weights:
     gram += np.diag([1e-9, prior, prior])
     values, vectors = np.linalg.eigh(np.linalg.inv(gram))
     roots = (vectors * np.sqrt(values.clip(min=0))[..., None, :]).astype(np.float32)
-    return Weights(np.ascontiguousarray(np.einsum("cmkij,cijmn->cnkij", series, roots, optimize=True)))
+    return np.ascontiguousarray(np.einsum("cmkij,cijmn->cnkij", series, roots, optimize=True))
 
 
 def _coverage(x: np.ndarray, y: np.ndarray, size: tuple[int, int], panorama: tuple[int, int]) -> np.ndarray:
@@ -146,7 +140,13 @@ def _changes(events: np.ndarray) -> np.ndarray:
 
 
 def _solved(
-    events: np.ndarray, weights: Weights, x: np.ndarray, y: np.ndarray, start: np.ndarray, iterations: int, noise: float
+    events: np.ndarray,
+    series: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    start: np.ndarray,
+    iterations: int,
+    noise: float,
 ) -> np.ndarray:
     """Conjugate gradients for the images, with the coverage as preconditioner."""
     slopes = np.float32(SLOPE_WEIGHT * noise / ROUNDING)
@@ -156,13 +156,13 @@ def _solved(
 
     def applied(images: np.ndarray) -> np.ndarray:
         _view(images, x, y, buffer)
-        _weigh(buffer, weights.series)
+        _weigh(buffer, series)
         out = np.float32(1e-5) * images
         _add_views(buffer, x, y, out)
         _add_slopes(images, slopes, out)
         return out
 
-    _weigh(buffer, weights.series)
+    _weigh(buffer, series)
     target = np.zeros_like(start)
     _add_views(buffer, x, y, target)
     images = start.copy()
@@ -182,12 +182,12 @@ def _solved(
 
 
 def _corrections(
-    images: np.ndarray, events: np.ndarray, weights: Weights, x: np.ndarray, y: np.ndarray
+    images: np.ndarray, events: np.ndarray, series: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """One Gauss-Newton step of the motion: changes of `x` and `y` with mean 0."""
     size = events.shape[-2:]
     left = _changes(events) - views(images, x, y, size)
-    _weigh(left, weights.series)
+    _weigh(left, series)
     limit = 3 * np.sqrt(np.square(left).mean())
     left = left.clip(-limit, limit)
     across, down = np.zeros_like(images), np.zeros_like(images)
@@ -202,7 +202,7 @@ def _corrections(
     xx, yy = xx + ridge, yy + ridge
     determinant = xx * yy - xy * xy
     dx, dy = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
-    shorter = np.minimum(1, LARGEST_MOVE / np.hypot(dx, dy).clip(min=1e-9))
+    shorter = np.minimum(1, MAX_MOVE / np.hypot(dx, dy).clip(min=1e-9))
     return dx * shorter - (dx * shorter).mean(), dy * shorter - (dy * shorter).mean()
 
 
@@ -355,16 +355,13 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--split", choices=("val", "test"), default="val")
     parser.add_argument("--limit", type=int, help="pictures of each set")
+    parser.set_defaults(sensor_limit=None)
     arguments = arguments_of(parser)
     record, config = machine_record(), settings()
     arguments.work.mkdir(parents=True, exist_ok=True)
     photographs = ingested(arguments.photographs, arguments.work / "rgb")
-    parts = {"photographs": part_of(photographs, arguments.work / "rgb", arguments.split, arguments.limit)}
-    all_test = ("ingest.source=polarization", "ingest.val_fraction=0", "ingest.test_fraction=1")
-    for folder in arguments.measured:
-        for name, root in sources_of(folder, arguments.work).items():
-            images = ingested(root, arguments.work / name, *all_test)
-            parts[f"measured.{name}"] = part_of(images, arguments.work / name, "test", arguments.limit)
+    conditions = conditions_of({"rgb": photographs}, arguments)
+    parts = {name: images for name, [(images, _)] in conditions.items() if name.startswith(("photographs", "measured"))}
     errors: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for part, images in parts.items():
         scenes = scenes_of(images, config)

@@ -103,7 +103,7 @@ def test_outside_a_clone_the_sensor_works_in_the_folder_where_it_was_fitted(ramp
     assert fitted == same != default
     capsys.readouterr()
     assert main([*clip, "sensor=other"]) == 1
-    assert "mine, noisy" in capsys.readouterr().err
+    assert "celex5, clean, davis346, default, gen41, mine, noisy, random" in capsys.readouterr().err
 
 
 def test_a_sensor_of_polarnet_or_of_the_user_is_not_replaced(ramps, capsys):
