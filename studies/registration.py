@@ -117,7 +117,7 @@ def _even(length: float) -> int:
 
 
 def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Float32[np.ndarray, "c 3 k h w"]:
-    """Orthonormal series of each pixel, shrunk. `_weigh` subtracts the parts along them, as the inverse covariance does."""
+    """Orthonormal series of each pixel, shrunk; the inverse covariance is that of `_weigh`, which subtracts them."""
     steps = THRESHOLD * events
     series = np.stack([np.ones_like(steps[:, 0]), steps[:, 0], steps[:, 1]], axis=1)
     gram = np.einsum("cmkij,cnkij->cijmn", series, series, optimize=True).astype(np.float64)
