@@ -189,7 +189,7 @@ def words_of(name: str, variant: int) -> list[str]:
 def outcome(
     names: tuple[str, str], delay: float, folder: Path, expected: dict[str, list[str | None]]
 ) -> tuple[str, str]:
-    """What two commands came to, and their messages."""
+    """Outcome of two commands, and their messages."""
     outputs = [folder / "first", folder / "second"]
     for output in outputs:
         output.unlink(missing_ok=True)

@@ -94,7 +94,7 @@ def views(
     y: Float64[np.ndarray, " k"],
     size: tuple[int, int],
 ) -> Float32[np.ndarray, "c k h w"]:
-    """What a sensor of this size sees with its first pixel at columns `x` and rows `y` of images."""
+    """Views of images by a sensor of this size, whose first pixel is at columns `x` and rows `y`."""
     out = np.empty((len(images), len(x), *size), np.float32)
     _view(np.ascontiguousarray(images), x, y, out)
     return out

@@ -38,9 +38,9 @@ from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
-from polarnet.simulation.motion import Trajectory, frame_times_us
+from polarnet.simulation.dataset import motion_over
+from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.scene import scene_from_polarization
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
@@ -156,9 +156,7 @@ def scored_sequence(
 
 def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
     """A stored scene with the events of the configured camera, which moves as when the scene was made."""
-    stored = scenes.read(name)
-    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-    trajectory = Trajectory.from_vector(scenes.trajectory(name))
+    scene, trajectory, _ = motion_over(scenes, name)
     t_us = torch.tensor(frame_times_us(config.synthesize))
     size = scenes.sensor_height, scenes.sensor_width
     events = emulate_motion(config.camera.drawn(config.seed, name), scene, trajectory, int(t_us[-1]), size, 1)

@@ -20,8 +20,7 @@ from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import BIN_EDGES, EventWindow, events_per_pixel
 from polarnet.methods.method import Recoverer
 from polarnet.simulation.camera import grid
-from polarnet.simulation.motion import Trajectory
-from polarnet.simulation.scene import scene_from_polarization
+from polarnet.simulation.dataset import motion_over
 from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
@@ -32,14 +31,11 @@ SHOWN = ("mse", "psnr", "ssim", "corr", "skill")
 
 def sequence_at(scenes: SceneStore, name: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
     """Events of a stored sequence, with exact truth at the window boundaries `t_us`."""
-    stored = scenes.read(name)
-    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-    trajectory = Trajectory.from_vector(scenes.trajectory(name))
+    scene, trajectory, _ = motion_over(scenes, name)
     pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
     intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *pixels))
-    valid, crosstalk = stored.valid, scenes.attributes.get("crosstalk", 0.0)
-    if valid is not None:
-        valid = valid_frames(valid, trajectory, t_us.tolist()[1:], pixels, crosstalk)
+    mask, crosstalk = scenes.read(name).valid if scenes.masked else None, scenes.attributes.get("crosstalk", 0.0)
+    valid = None if mask is None else valid_frames(mask, trajectory, t_us.tolist()[1:], pixels, crosstalk)
     s0 = intensity[:, 0] + intensity[:, 2]
     return TestSequence(name, scenes.scene_of[name], events, t_us, dolp, aolp, s0, valid)
 

@@ -136,8 +136,8 @@ def emulate(
     fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
     clip. `key`, modulo 2^64, seeds all noise, which each channel draws by its number in `channels` (default: 0, 1,
     ...). Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels.
-    TypeError for anything but an array; ValueError for times that `_checked_times` refuses, values that are not finite
-    or outside 0..255, and sizes that do not fit.
+    TypeError for anything but an array; ValueError for times that do not increase, are beyond 2^53 us or more than 71
+    minutes apart, values that are not finite or outside 0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -185,10 +185,7 @@ def emulate_lights(
     state: SensorState | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
-    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once.
-
-    ValueError for times that `_checked_times` refuses.
-    """
+    """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
     forget_stale_code()
     numbers, height, width, config, key = channels
     model = MODELS[config.model]

@@ -64,9 +64,7 @@ class Pose(NamedTuple):
 
     x: Float64[np.ndarray, "*n"]  # scene column under the sensor's centre
     y: Float64[np.ndarray, "*n"]  # scene row
-    angle: Float64[
-        np.ndarray, "*n"
-    ]  # radians by which the camera is rolled clockwise: picture and AoLP turn the other way
+    angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled clockwise; the picture turns the other way
     zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1
 
 

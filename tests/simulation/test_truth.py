@@ -13,6 +13,7 @@ from part_fixtures import files_of
 from PIL import Image
 from simulation_fixtures import REST, STILL
 
+from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
@@ -234,3 +235,12 @@ def test_the_truth_of_a_mosaic_is_that_of_the_centres_of_its_cells():
     cells = torch.nn.functional.avg_pool2d(scene.stokes[None, :, 10:30, 15:45], 2)[0]
     assert intensities.shape == (1, 4, 10, 15)
     torch.testing.assert_close(degree[0], dolp(cells), atol=1e-5, rtol=0)
+
+
+def test_truth_at_any_time_is_that_of_the_stretched_scene(images, tmp_path):
+    synthesis = Synthesis(images, dataclasses.replace(CONFIG, dynamic_range=1000.0), 1, SEQUENCES_PER_PART)
+    synthesize(synthesis, tmp_path / "scenes", tmp_path / "frames", map)
+    scenes, frames = SceneStore.open(tmp_path / "scenes"), FrameStore.open(tmp_path / "frames")
+    name = scenes.sequences[0]
+    result = sequence_at(scenes, name, [], frames.t_us(name))
+    torch.testing.assert_close(result.dolp, frames.frames(name, 1).dolp, atol=1e-4, rtol=0)

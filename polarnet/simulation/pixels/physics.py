@@ -68,8 +68,8 @@ class PixelConfig:
     """Noise events per second of a pixel in the dark, ON and OFF together; a quarter of it at full brightness."""
     refractory_period_us: NonNegativeFloat
     refractory: Annotated[str, one_of(("keep", "reset"))]
-    """What happens to a change of light within the refractory period: it is kept and reported later, or the pixel is
-    held in reset and forgets it: its reference is then the light at the end of the period."""
+    """Fate of a change of light within the refractory period: kept and reported later, or forgotten by a pixel that is
+    held in reset, whose reference is then the light at the end of the period."""
 
     def __post_init__(self):
         if self.photoreceptor_noise and not self.cutoff_hz:
