@@ -3,7 +3,6 @@
 import functools
 import multiprocessing
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -69,6 +68,7 @@ def _over_processes(
 
 def _start_worker(threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with_parent()
     limit_threads(threads)
     tune()
@@ -92,9 +92,9 @@ def _collect(
             "runtime.workers=1"
         ) from error
     with executor as pool:
-        with _interrupts_ignored():  # by the workers too, until they are set up: their imports would show tracebacks
-            futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
         try:
+            with _interrupts_held():  # by the workers too, until they are set up: their imports would show tracebacks
+                futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
             for future in as_completed(futures):
                 results[futures[future]] = future.result()
                 bar.update()
@@ -107,16 +107,13 @@ def _collect(
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C in this process, and in those that it starts meanwhile."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread sets signals
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _interrupts_held() -> Iterator[None]:
+    """Put off Ctrl-C in this thread until the end, and in processes that it starts meanwhile until they allow it."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: Bar) -> list[Result]:

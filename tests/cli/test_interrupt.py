@@ -18,7 +18,7 @@ def heed_interrupts() -> None:
 
 
 def interrupted(command, folder, ready, project_root):
-    """Exit status and standard error of a command that gets SIGINT once `ready()` is true."""
+    """Status, as a shell gives it, and standard error of a command that gets SIGINT once `ready()` is true."""
     environment = os.environ | {"PYTHONPATH": str(project_root)}
     with subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                           env=environment, start_new_session=True, preexec_fn=heed_interrupts) as process:  # fmt: skip
@@ -27,6 +27,8 @@ def interrupted(command, folder, ready, project_root):
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal sends it, to all processes of the command
         _, error = process.communicate(timeout=60)
+    if process.returncode == -signal.SIGINT:  # Python's own end where the interrupt fell into code from a string
+        return 128 + signal.SIGINT, error
     return process.returncode, error
 
 
