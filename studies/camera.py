@@ -67,7 +67,7 @@ def calibrated_analyzers(camera: Camera, seed: int) -> Float64[Tensor, "4 3 h w"
     rotation = Rotation(np.array([0.0, 1.0]) / rate_hz * 1e6, np.array([0.0, 2 * math.pi]))
     analyzers = []
     for turned, risen in zip(
-        simulate_video(turning, t_us, camera, seed), simulate_video(rising, t_us, camera, seed), strict=True
+        *(simulate_video(frames, t_us, camera, seed).events for frames in (turning, rising)), strict=True
     ):
         degree, angle, _ = (one.double() for one in fit_half_turn(turned, rotation, HALF_TURN_US, config))
         place = (risen.y.long() * risen.width + risen.x).numpy()

@@ -12,7 +12,7 @@ from torch import Tensor
 from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array
 from polarnet.runtime.machine import generator_for, one_thread
-from polarnet.simulation.camera import Camera, grid, weights_of
+from polarnet.simulation.camera import Camera, grid, pixel_analyzers, weights_of
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate_frames
 from polarnet.simulation.motion import SynthesizeConfig, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import (
@@ -104,6 +104,26 @@ def video_pieces(
         yield Piece(chunk[-1].t_us, events, t_us, truth)
 
 
+class VideoSimulation(NamedTuple):
+    """A camera at rest that sees a video; its fields are those of `Simulation`.
+
+    >>> import torch
+    >>> from polarnet.clips import simulate_video
+    >>> from polarnet.simulation import POLARIZERS, SENSORS, Camera
+    >>> camera = Camera(SENSORS["default"], POLARIZERS["micropolarizers"])
+    >>> simulate_video(torch.rand(2, 3, 16, 24), [0, 1000], camera, seed=1).analyzer.shape
+    torch.Size([4, 3, 8, 12])
+    """
+
+    events: list[Events]
+    """Behind the polarizers at 0, 45, 90 and 135 degrees, in microseconds from the first frame."""
+    camera: Camera
+    """The camera, with the values that it drew where its parameters have ranges (`randomise`)."""
+    analyzer: Float32[Tensor, "4 3 *pixels"]
+    """Weights of S0, S1 and S2 in the light behind the four polarizers, of each pixel if pixels differ
+    (`pixel_analyzers`)."""
+
+
 def simulate_video(
     frames: Iterable[Float[Array, "3 _h _w"] | PolarizationScene],
     t_us: Sequence[int],
@@ -111,8 +131,8 @@ def simulate_video(
     seed: int,
     upsample: bool = False,
     threads: int = 1,
-) -> list[Events]:
-    """Events of the four channels of a camera at rest, each pixel of which sees one pixel of `frames`.
+) -> VideoSimulation:
+    """Simulate a camera at rest, each pixel of which sees one pixel of `frames`.
 
     Frames are RGB pictures as for `simulate`, or scenes, at whole microseconds `t_us` from 0. With `upsample`,
     interpolated frames are added so that nothing moves by more than about one pixel a step. The number of threads
@@ -122,7 +142,7 @@ def simulate_video(
     >>> from polarnet.clips import simulate_video
     >>> from polarnet.simulation import SENSORS
     >>> frames = torch.rand(3, 3, 16, 24)
-    >>> [channel.height for channel in simulate_video(frames, [0, 1000, 2000], SENSORS["default"], seed=1)]
+    >>> [channel.height for channel in simulate_video(frames, [0, 1000, 2000], SENSORS["default"], seed=1).events]
     [16, 16, 16, 16]
     """
     camera = sensor if isinstance(sensor, Camera) else Camera(sensor)
@@ -130,7 +150,9 @@ def simulate_video(
         raise ValueError(f"t_us: expected one time a frame, starting at 0, got {list(t_us[:5])}")
     pieces = list(video_pieces(stokes_frames(frames, t_us), camera, seed, upsample, threads))
     channels = [concatenate(channel) for channel in zip(*(piece.events for piece in pieces), strict=True)]
-    return leave_sensors(channels, camera.drawn(seed, "video"), int(t_us[-1]))
+    pitch, camera = grid(camera.polarizers.layout, 2, 2).pitch, camera.drawn(seed, "video")
+    analyzer = pixel_analyzers(camera, pitch * channels[0].height, pitch * channels[0].width)
+    return VideoSimulation(leave_sensors(channels, camera, int(t_us[-1])), camera, analyzer)
 
 
 def stokes_frames(

@@ -120,7 +120,7 @@ def test_one_measurement_of_polarization_is_a_scene_under_a_moving_sensor():
 def test_an_mp4_gives_the_events_of_its_frames_at_its_own_times_and_all_channels_see_the_same_grey(capsys):
     write_video("walk.mp4", scenery(3))
     assert main(["simulate", "walk.mp4", "--out", "out", "sensor=noisy", "seed=7"]) == 0
-    assert_equal(stored(), simulate_video(rgb(decoded("walk.mp4")), T_US, SENSORS["noisy"], seed=7))
+    assert_equal(stored(), simulate_video(rgb(decoded("walk.mp4")), T_US, SENSORS["noisy"], seed=7).events)
     assert "0.167 s, 6 true frames" in capsys.readouterr().out
     preview = cv2.VideoCapture("out/preview.mp4")
     assert preview.get(cv2.CAP_PROP_FRAME_COUNT) == FRAMES - 1
@@ -143,7 +143,7 @@ def test_a_folder_of_frames_has_the_times_of_its_rate_or_of_a_file_and_the_order
         ([], [1000 * k + k % 2 for k in range(12)]),
     ):
         assert main(["simulate", "walk", "--out", "out", *given, "--no-preview"]) == 0
-        assert_equal(stored(), simulate_video(rgb(frames), t_us, SENSORS["default"], seed=1))
+        assert_equal(stored(), simulate_video(rgb(frames), t_us, SENSORS["default"], seed=1).events)
 
 
 @pytest.mark.parametrize("kind", ["videos", "renamed", "folder"])
@@ -162,7 +162,7 @@ def test_four_angles_give_the_events_of_the_measured_scenes(tmp_path, kind):
         given = [f"{names[k]}.mp4" for k in order]
         given += ["--angles", *(str(POLARIZER_ANGLES_DEG[k]) for k in order)] if kind == "renamed" else []
     assert main(["simulate", *given, "--out", "out"]) == 0
-    assert_equal(stored(), simulate_video(scenes(frames), T_US, SENSORS["default"], seed=1))
+    assert_equal(stored(), simulate_video(scenes(frames), T_US, SENSORS["default"], seed=1).events)
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])
@@ -176,7 +176,7 @@ def test_raw_mosaics_give_the_events_of_the_demosaicked_scenes(tmp_path, kind):
         frames, given = frames[..., 0], ["walk", "--fps", "30"]
     assert main(["simulate", *given, "--out", "out", "--mosaic", MOSAIC]) == 0
     angles = np.stack([demosaic(frame.astype(np.float64), parse_mosaic(MOSAIC)) for frame in frames])
-    expected = simulate_video(scenes(angles), T_US, SENSORS["default"], seed=1)
+    expected = simulate_video(scenes(angles), T_US, SENSORS["default"], seed=1).events
     assert (expected[0].height, expected[0].width) == (10, 14)
     assert_equal(stored(), expected)
 
@@ -189,7 +189,7 @@ def test_sizes_polarizers_readout_and_upsampling_are_those_of_the_python_call():
     small = [torch.from_numpy(fit(frame, 20, 30, 1.0).transpose(2, 0, 1).copy()) for frame in frames]
     readout = replace(PERFECT, jitter_us=50.0, max_events_per_s=300_000.0, max_wait_us=1000.0)
     camera = Camera(SENSORS["default"], POLARIZERS["micropolarizers"], readout)
-    expected = simulate_video(small, T_US, camera, seed=1, upsample=True)
+    expected = simulate_video(small, T_US, camera, seed=1, upsample=True).events
     assert (expected[0].height, expected[0].width) == (10, 15)
     assert_equal(stored(), expected)
     assert zarr.open_group("out/truth.zarr", mode="r")["t_us"][:].tolist() == T_US
@@ -314,7 +314,7 @@ def test_levels_above_the_first_frames_bits_are_refused_and_white_names_the_leve
     assert "frame 3: expected levels up to 1023" in capsys.readouterr().err
     assert main(["simulate", "walk", "--fps", "30", "--white", "4095", "--out", "out"]) == 0
     expected = [scene_from_intensities(torch.from_numpy((f / 8190).astype(np.float32))) for f in levels]
-    assert_equal(stored(), simulate_video(expected, T_US, SENSORS["default"], seed=1))
+    assert_equal(stored(), simulate_video(expected, T_US, SENSORS["default"], seed=1).events)
 
 
 def test_a_long_clip_does_not_stay_in_memory(monkeypatch):

@@ -14,7 +14,16 @@ from polarnet.clips import video as video_module
 from polarnet.clips.video import moving_pieces, video_pieces
 from polarnet.events.stream import concatenate
 from polarnet.runtime.machine import seed_for
-from polarnet.simulation import MOTIONS, POLARIZERS, SENSORS, Camera, PolarizationScene, emulate, simulate
+from polarnet.simulation import (
+    MOTIONS,
+    POLARIZERS,
+    SENSORS,
+    Camera,
+    PolarizationScene,
+    emulate,
+    pixel_analyzers,
+    simulate,
+)
 from polarnet.simulation.scene import check_scene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame, upsampled
 from polarnet.stokes import intensities_from_stokes
@@ -55,10 +64,10 @@ def test_a_video_gives_what_emulate_gives_for_the_light_behind_ideal_polarizers(
     light = 255 * intensities_from_stokes(stokes)
     light = (light + 0.5).to(torch.uint8) if model == "v2e" else light
     expected, _ = emulate(light, np.array(t_us), sensor, seed_for(5, "video", "emulate"))
-    got = simulate_video(frames, t_us, sensor, seed=5)
+    got = simulate_video(frames, t_us, sensor, seed=5).events
     counts = [len(events) for events in got]
     assert counts == pytest.approx([len(events) for events in expected], rel=0.002, abs=2)
-    assert all(map(equal, simulate_video(frames, t_us, sensor, seed=5, threads=2), got))
+    assert all(map(equal, simulate_video(frames, t_us, sensor, seed=5, threads=2).events, got))
     assert sum(counts) > 100
 
 
@@ -66,11 +75,21 @@ def test_a_dofp_sensor_sees_a_uniform_scene_as_four_sensors_do_but_half_as_large
     """Without differences between pixels, noise and mismatch, every pixel of a channel fires alike."""
     frames = [level * torch.tensor([1.0, 0.5, 0.25]).view(3, 1, 1).expand(3, H, W) for level in (0.2, 0.5, 1.0)]
     mosaic = replace(POLARIZERS["ideal"], layout="dofp")
-    four, dofp = (simulate_video(frames, [0, 1000, 2000], Camera(QUIET, p), 1) for p in (POLARIZERS["ideal"], mosaic))
+    cameras = [Camera(QUIET, polarizers) for polarizers in (POLARIZERS["ideal"], mosaic)]
+    four, dofp = (simulate_video(frames, [0, 1000, 2000], camera, 1).events for camera in cameras)
     for one, other in zip(four, dofp, strict=True):
         assert (other.height, other.width) == (H // 2, W // 2)
         assert len(one) == 4 * len(other) > 0
         assert one.t.unique().tolist() == other.t.unique().tolist()
+
+
+@pytest.mark.parametrize("polarizers", ["film", "micropolarizers"])
+def test_a_video_comes_with_its_camera_and_the_analyzer_of_each_pixel(polarizers):
+    camera = Camera(SENSORS["random"], POLARIZERS[polarizers])
+    result = simulate_video(moving_frames(2, 1), [0, 1000], camera, seed=7)
+    assert result.camera == camera.drawn(7, "video")
+    assert torch.equal(result.analyzer, pixel_analyzers(result.camera, H, W))
+    assert result.analyzer.shape == ((4, 3) if polarizers == "film" else (4, 3, H // 2, W // 2))
 
 
 def test_the_truth_of_a_dofp_sensor_is_the_mean_of_each_cell():
