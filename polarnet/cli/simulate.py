@@ -5,6 +5,7 @@ import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from polarnet.pictures.images import fit
 from polarnet.recordings.writers import h5py_module
 from polarnet.runtime.machine import configure, threads_of
 from polarnet.simulation.motion import frame_times_us
-from polarnet.simulation.scene import PolarizationScene, scene_from_intensities, scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, scene_from_intensities, scene_from_light, scene_from_rgb
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import parse_mosaic
 
@@ -64,7 +65,7 @@ def simulate(options: argparse.Namespace) -> None:
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         config = load(settings_root(), overrides, folder)
     configure(config.runtime, config.seed)
-    gamma = None if options.no_preview else 2.2 if clip.measured else 1.0
+    gamma = None if options.no_preview else 2.2 if clip.measured or clip.light else 1.0
     attributes = {**config.camera.sections, "seed": config.seed, "input": clip.name, "kind": clip.words}
     attributes |= {"upsample": options.upsample, "polarnet": __version__}
     with run_folder(out, "simulate") as partial:
@@ -129,9 +130,10 @@ def _run(config: Config, clip: Clip, times: Times | None, output: Output) -> dic
     threads, saturation = threads_of(config.runtime), [0.0]
     total: int | None
     if times is None:
-        pieces = moving_pieces(_scene(config, clip, saturation), config.synthesize, config.camera, config.seed, threads)
-        output.attributes["synthesize"] = vars(config.synthesize)
-        camera, total = config.camera.drawn(config.seed, "picture"), len(frame_times_us(config.synthesize))
+        motion = replace(config.synthesize, dynamic_range=None) if clip.light else config.synthesize
+        pieces = moving_pieces(_scene(config, clip, saturation), motion, config.camera, config.seed, threads)
+        output.attributes["synthesize"] = vars(motion)
+        camera, total = config.camera.drawn(config.seed, "picture"), len(frame_times_us(motion))
     else:
         frames = timed_frames(clip, times, saturation)
         pieces = video_pieces(frames, config.camera, config.seed, output.attributes["upsample"], threads)
@@ -158,7 +160,9 @@ def _scene(config: Config, clip: Clip, saturation: list[float]) -> PolarizationS
 
 def _polarized(clip: Clip, frame: ClipFrame) -> PolarizationScene:
     planes = torch.from_numpy(frame.pixels.transpose(2, 0, 1).copy())
-    return scene_from_intensities(planes) if clip.measured else scene_from_rgb(planes)
+    if clip.measured:
+        return scene_from_intensities(planes)
+    return scene_from_light(planes) if clip.light else scene_from_rgb(planes)
 
 
 def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[StokesFrame]:

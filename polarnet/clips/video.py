@@ -22,7 +22,7 @@ from polarnet.simulation.moving_sensor import (
     leave_sensors,
     render_times_us,
 )
-from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb
+from polarnet.simulation.scene import PolarizationScene, check_scene, scene_from_rgb, stretched
 from polarnet.simulation.upsampling import StokesFrame, upsampled
 
 MOTION_STEPS = 64  # rendered frames in a piece of a moving sensor's simulation
@@ -44,7 +44,7 @@ def moving_pieces(
 ) -> Iterator[Piece]:
     """Simulate a moving sensor in pieces; joined and read out (`leave_sensors`), the events are those of `simulate`."""
     trajectory = random_trajectory(motion, scene.height, scene.width, generator_for(seed, "picture", "motion"))
-    camera = camera.drawn(seed, "picture")
+    camera, scene = camera.drawn(seed, "picture"), stretched(scene, motion.dynamic_range)
     size = motion.sensor_height, motion.sensor_width
     pixels = grid(camera.polarizers.layout, *size)
     frames_us = np.array(frame_times_us(motion))

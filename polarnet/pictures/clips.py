@@ -1,5 +1,6 @@
 """Clips: the frames of a video or of a folder, in colour or behind polarizers, one after another in constant memory."""
 
+import functools
 import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +31,7 @@ class ClipFrame(NamedTuple):
     """One frame, scaled to the size of its clip."""
 
     pixels: Float32[np.ndarray, "h w channels"]
-    """RGB code values in [0, 1], or linear intensities at 0, 45, 90 and 135 degrees with I0 + I90 in [0, 1]."""
+    """RGB code values or light in [0, 1], or intensities at 0, 45, 90 and 135 degrees with I0 + I90 in [0, 1]."""
     t_us: float | None  # time that the video states
     saturated: float  # share of pixels with a saturated angle; 0 for RGB
 
@@ -58,6 +59,7 @@ class Clip:
     measured: bool  # whether the channels of a frame are four polarizers, not RGB
     count: int | None  # number of frames; None: not known before the end
     still: bool  # whether the clip is a single picture or measurement; False for a video of one frame
+    light: bool  # whether the RGB values are linear light in place of sRGB code values
     frames: Callable[[], Iterator[ClipFrame]]
 
 
@@ -114,8 +116,9 @@ def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
 def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
     measured = extension(groups[0][0]) == "npz" or len(groups[0]) > 1
     if not measured and options.mosaic is None:
-        kind = "photograph" if len(groups) == 1 else "frames"
-        return _coloured(name, kind, _from_files(groups, _rgb), options)
+        white = None if len(groups) == 1 else 1.0
+        files, light = _from_files(groups, functools.partial(_rgb, white=white)), images.holds_light(groups[0][0])
+        return _coloured(name, "photograph" if len(groups) == 1 else "frames", files, options, light)
     kind, read = ("four polarizers", polarimetry.read_levels) if measured else ("raw mosaics", polarimetry.read_raw)
     return _measured(name, kind, _from_files(groups, read), options)
 
@@ -131,13 +134,15 @@ def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, 
     return _Files(len(groups), len(groups) == 1, levels)
 
 
-def _rgb(paths: tuple[Path, ...]) -> Float32[np.ndarray, "3 h w"]:
-    """sRGB code values; a picture with one channel is grey."""
+def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3 h w"]:
+    """sRGB code values, or light as shares of `white` (`images.light_of`); a picture with one channel is grey."""
     (path,) = paths
     channels = images.read_channels(path)
     if channels.shape[2] == 1:
         return np.repeat(code_fractions(channels).transpose(2, 0, 1), 3, axis=0)
     picture = images.read_picture(path)
+    if images.holds_light(path):
+        return images.light_of(picture, white).transpose(2, 0, 1)
     return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 
@@ -205,7 +210,7 @@ def _videos_by_angle(paths: Sequence[Path], angles: Sequence[int] | None) -> lis
     return [path for _, path in sorted(zip(angles, paths, strict=True))]
 
 
-def _coloured(name: str, kind: str, files: _Files, options: ClipOptions) -> Clip:
+def _coloured(name: str, kind: str, files: _Files, options: ClipOptions, light: bool = False) -> Clip:
     def frames() -> Iterator[ClipFrame]:
         for rgb, t_us in _of_one_size(files):
             pixels = np.ascontiguousarray(rgb.transpose(1, 2, 0))
@@ -213,7 +218,7 @@ def _coloured(name: str, kind: str, files: _Files, options: ClipOptions) -> Clip
                 pixels = np.repeat(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
             yield ClipFrame(_scaled(pixels, options.size), t_us, 0.0)
 
-    return Clip(name, f"{'grey' if options.grey else 'RGB'} {kind}", False, files.count, files.still, frames)
+    return Clip(name, f"{'grey' if options.grey else 'RGB'} {kind}", False, files.count, files.still, light, frames)
 
 
 def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
@@ -234,7 +239,7 @@ def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Cli
             pixels = polarimetry.without_saturation(values, saturated).astype(np.float32).transpose(1, 2, 0)
             yield ClipFrame(_scaled(np.ascontiguousarray(pixels), options.size), t_us, float(saturated.any(0).mean()))
 
-    return Clip(name, words, True, files.count, files.still, frames)
+    return Clip(name, words, True, files.count, files.still, False, frames)
 
 
 def _of_one_size(files: _Files) -> Iterator[tuple[Levels, float | None]]:

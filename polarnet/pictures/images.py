@@ -22,6 +22,7 @@ LEAST_WHITE = 2.0**-16  # largest value of a float picture: below it, 16 bits ho
 SRGB = "srgb_rec709_scene"  # OpenImageIO's name
 TAKEN_AS_SRGB = {"", SRGB, "g22_rec709_scene"}  # a PNG that says gamma 1/2.2 is how older programs wrote sRGB
 LINEAR_FORMATS = {"openexr", "hdr"}  # hold linear light unless they say otherwise
+LIGHT = ".npy"  # suffix of pictures of linear light, float32 [height, width, 3], in data/images
 CAMERA_RAW = frozenset([
     "dng", "nef", "nrw", "cr2", "cr3", "crw", "arw", "srf", "sr2", "raf", "orf", "rw2", "pef", "srw", "3fr", "iiq",
     "erf", "mrw", "x3f",
@@ -80,13 +81,12 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     """
     pixels, spec, file_format = _read(Path(path))
     profile = spec.get("ICCProfile")
-    linear = file_format in LINEAR_FORMATS
     if profile is None and file_format == "png" and _names_profile(Path(path)):
         raise UnreadablePicture("the embedded colour profile is damaged; save the file again, with or without one")
     return Picture(
         pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, spec.alpha_channel)]),
         profile=None if profile is None else np.asarray(profile, dtype=np.uint8).tobytes(),
-        colour_space=spec.get_string_attribute("oiio:ColorSpace") or ("lin_rec709_scene" if linear else ""),
+        colour_space=_colour_space(spec, file_format),
         profile_name=spec.get_string_attribute("ICCProfile:profile_description") or None,
         author=spec.get_string_attribute("Artist") or None,
         licence=spec.get_string_attribute("Copyright") or None,
@@ -203,17 +203,50 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
 def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
     """Light of a picture in linear floating-point numbers (OpenEXR, Radiance HDR), as shares of the brightest value.
 
-    Nothing is clipped at white or encoded, so that the picture keeps its range; negative values become 0.
-    UnreadablePicture as `read_picture`, for other files, and for a picture without light.
+    UnreadablePicture as `read_picture`, for a file that does not hold light, and for a picture without light.
+
+    >>> import numpy as np
+    >>> import OpenImageIO as oiio
+    >>> from polarnet.pictures import read_light
+    >>> oiio.ImageBuf(np.array([[[20.0, 2.0, 2e-5]]], np.float32)).write("lamp.exr")
+    True
+    >>> read_light("lamp.exr").ravel()
+    tensor([1.0000e+00, 1.0000e-01, 1.0000e-06])
     """
     picture = read_picture(path)
-    if picture.pixels.dtype != np.float32 or "lin" not in picture.colour_space or not picture.pixels.max() > 0:
+    if not holds_light(path):
         raise UnreadablePicture(
             f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} "
             f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
         )
-    light = np.clip(picture.pixels, 0, None) / picture.pixels.max()
-    return torch.from_numpy(np.ascontiguousarray(light.transpose(2, 0, 1)))
+    return torch.from_numpy(np.ascontiguousarray(light_of(picture).transpose(2, 0, 1)))
+
+
+def holds_light(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds linear light in floating-point numbers, as OpenEXR and Radiance HDR files do.
+
+    Only its header is read; False for a file that cannot be opened.
+    """
+    try:
+        file = _opened(Path(path))
+    except UnreadablePicture:
+        return False
+    spec, file_format = file.spec(), file.format_name()
+    file.close()
+    floating = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    return floating and "lin" in _colour_space(spec, file_format)
+
+
+def light_of(picture: Picture, white: float | None = None) -> Float32[np.ndarray, "h w 3"]:
+    """Pixels of a picture of linear light as shares of `white`, clipped to [0, 1]; None: of its brightest value.
+
+    Without `white` nothing is clipped but negative values, so that the picture keeps its range. UnreadablePicture for a
+    picture without light.
+    """
+    white = float(picture.pixels.max()) if white is None else white
+    if not white > 0:
+        raise UnreadablePicture("no light: no value is above 0")
+    return np.clip(picture.pixels / np.float32(white), 0, 1)
 
 
 def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
@@ -223,15 +256,7 @@ def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w 
         raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")
     if kind in NOT_IN_THE_WHEEL:
         raise UnreadablePicture(f"OpenImageIO's wheel has no reader for .{kind}; convert it to PNG or TIFF first")
-    try:
-        str(path).encode("utf-8")
-    except UnicodeEncodeError:
-        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it") from None
-    unmultiplied = oiio.ImageSpec()
-    unmultiplied["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
-    file = oiio.ImageInput.open(str(path), unmultiplied)
-    if file is None:
-        raise UnreadablePicture(f"cannot be read: {_first_line(oiio.geterror(), path)}")
+    file = _opened(path)
     try:
         spec = file.spec()
         if spec.width * spec.height > MAX_PIXELS:
@@ -244,6 +269,26 @@ def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w 
         raise UnreadablePicture(f"cannot be read: {_first_line(problem, path)}")
     orientation = 1 if as_stored else spec.get_int_attribute("Orientation", 1)
     return upright(_plain(pixels), orientation), spec, file.format_name()
+
+
+def _opened(path: Path) -> Any:
+    """OpenImageIO's reader of a file; UnreadablePicture if it cannot be opened."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise UnreadablePicture("cannot be read: the name of the file is not UTF-8; rename it") from None
+    unmultiplied = oiio.ImageSpec()
+    unmultiplied["oiio:UnassociatedAlpha"] = 1  # otherwise the reader multiplies the colours by alpha
+    file = oiio.ImageInput.open(str(path), unmultiplied)
+    if file is None:
+        raise UnreadablePicture(f"cannot be read: {_first_line(oiio.geterror(), path)}")
+    return file
+
+
+def _colour_space(spec: Any, file_format: str) -> str:
+    """OpenImageIO's name of a file's encoding; empty if it is not known."""
+    named = spec.get_string_attribute("oiio:ColorSpace")
+    return named or ("lin_rec709_scene" if file_format in LINEAR_FORMATS else "")
 
 
 def _names_profile(png: Path) -> bool:

@@ -29,6 +29,7 @@ from polarnet.runtime.splits import SPLITS
 
 logger = logging.getLogger(__name__)
 
+LIGHT_BITS = 32  # of a channel of a picture of light
 EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
@@ -80,7 +81,7 @@ class Source:
 
 
 def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    """Fill `folder` with PNG pictures of config.height x config.width and their manifest, replacing its content.
+    """Fill `folder` with pictures of config.height x config.width and their manifest, replacing its content.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`. Neither the mapper nor
     the order of the files changes the result, and `folder` is never half full. Logs a warning for every file skipped;
@@ -194,20 +195,27 @@ def _edge_hash(files: Sequence[Path]) -> str:
 
 
 def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, cut, scale and convert one file to `folder`/source-<number>.png, or return the reason why not."""
+    """Read, cut and scale one file to `folder`/source-<number>, or return the reason why not.
+
+    Linear light in floating-point numbers stays as it is, in a .npy file. Other pictures become sRGB in a .png file.
+    """
     number, source = item
     try:
-        picture = images.read_picture(source.files[0])
-        fitted = images.fit(picture.pixels, config.height, config.width, config.max_upscale)
-        rgb = images.srgb_of(fitted, picture)
+        picture, light = images.read_picture(source.files[0]), images.holds_light(source.files[0])
+        pixels = images.light_of(picture) if light else picture.pixels
+        fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
+        rgb = fitted if light else images.srgb_of(fitted, picture)
     except UnreadablePicture as error:
         return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
-    file = f"source-{number:08d}.png"
-    write_png(folder / file, rgb, picture.bits)
+    file, bits = f"source-{number:08d}{images.LIGHT if light else '.png'}", LIGHT_BITS if light else picture.bits
+    if light:
+        np.save(folder / file, rgb)
+    else:
+        write_png(folder / file, rgb, bits)
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{picture.sha256[:8]}", file=file, source=source.kind, origin=source.origin,
         licence=source.licence or picture.licence, author=source.author or picture.author, sha256=picture.sha256,
-        bits=picture.bits, height=config.height, width=config.width, source_height=picture.pixels.shape[0],
+        bits=bits, height=config.height, width=config.width, source_height=picture.pixels.shape[0],
         source_width=picture.pixels.shape[1], colour_profile=picture.profile_name,
     )  # fmt: skip
 

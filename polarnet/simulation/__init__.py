@@ -10,6 +10,7 @@ from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.pictures.builtin import BUILTIN_PHOTOS as BUILTIN_PHOTOS
+    from polarnet.pictures.images import read_light as read_light
     from polarnet.pictures.images import read_rgb as read_rgb
     from polarnet.simulation.camera import Camera as Camera
     from polarnet.simulation.camera import pixel_analyzers as pixel_analyzers
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from polarnet.simulation.presets import SENSORS as SENSORS
     from polarnet.simulation.scene import PolarizationScene as PolarizationScene
     from polarnet.simulation.scene import scene_from_intensities as scene_from_intensities
+    from polarnet.simulation.scene import scene_from_light as scene_from_light
     from polarnet.simulation.scene import scene_from_polarization as scene_from_polarization
     from polarnet.simulation.scene import scene_from_rgb as scene_from_rgb
     from polarnet.simulation.sequence import Simulation as Simulation

@@ -91,8 +91,8 @@ def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: in
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:
     """The scene of a stored sequence, the motion over it, and its duration in microseconds."""
     stored = scenes.read(sequence)
-    dynamic_range = scenes.attributes.get("synthesize", {}).get("dynamic_range")
-    scene = stretched(scene_from_polarization(stored.s0, stored.dolp, stored.aolp), dynamic_range)
+    scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
+    scene = stretched(scene, scenes.dynamic_range(sequence))
     return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
 
 

@@ -13,6 +13,9 @@ from polarnet.runtime.arrays import Array, check_range, check_shape, floats, fra
 from polarnet.stokes import stokes_from_intensities, stokes_from_polarization
 
 EPSILON = np.finfo(np.float32).eps  # keeps grey and black from dividing by 0
+LIGHT_RANGE = 1e8
+"""Brightest over darkest light of a picture of light in scenes.zarr: less than 0.000003 DN is dark, the smallest dark
+current being 0.0001 DN. The store's 16 bits are logarithmic then, in steps of 0.03 %."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,25 @@ def scene_from_rgb(rgb: Float[Array, "3 h w"]) -> PolarizationScene:
     return scene_from_polarization(*polarization_from_rgb(rgb))
 
 
+def polarization_from_light(light: Float[Array, "3 h w"]) -> Float32[Tensor, "3 h w"]:
+    """As `polarization_from_rgb`, for linear light of many decades: hue and saturation are right in the dark, too."""
+    light = fractions("light", light, "3 height width", "RGB").float()
+    value = light.amax(dim=0)
+    _, dolp, aolp = polarization_from_rgb(light / torch.where(value > 0, value, 1.0))
+    return torch.stack([value, dolp, aolp])
+
+
+def scene_from_light(light: Float[Array, "3 h w"]) -> PolarizationScene:
+    """The scene of linear RGB light in [0, 1], as `read_light` reads it; raises as `scene_from_rgb`.
+
+    >>> import torch
+    >>> from polarnet.simulation import scene_from_light
+    >>> scene_from_light(torch.tensor([1e-6, 5e-7, 5e-7]).view(3, 1, 1)).stokes[:, 0, 0]
+    tensor([1.0000e-06, 5.0000e-07, 0.0000e+00])
+    """
+    return scene_from_polarization(*polarization_from_light(light))
+
+
 def stretched(scene: PolarizationScene, dynamic_range: float | None) -> PolarizationScene:
     """The scene with S0 replaced by dynamic_range^(S0 - 1), from 1 / dynamic_range to 1; DoLP and AoLP stay.
 
@@ -117,6 +139,17 @@ def stretched(scene: PolarizationScene, dynamic_range: float | None) -> Polariza
     light = torch.exp((s0 - 1) * math.log(dynamic_range))
     shares = torch.where(s0 > 0, scene.stokes[1:].double() / torch.where(s0 > 0, s0, 1.0), 0.0)
     return PolarizationScene(torch.cat([light[None], shares * light]).float())
+
+
+def logarithmic(s0: Float[Tensor, "h w"], dynamic_range: float) -> Float32[Tensor, "h w"]:
+    """The S0 that `stretched` stretches to this one; light below 1 / dynamic_range counts as that.
+
+    >>> import torch
+    >>> from polarnet.simulation.scene import logarithmic
+    >>> logarithmic(torch.tensor([[1.0, 0.001, 0.0]]), 1e6)
+    tensor([[1.0000, 0.5000, 0.0000]])
+    """
+    return (1 + s0.double().clamp(min=1 / dynamic_range).log() / math.log(dynamic_range)).clamp(0, 1).float()
 
 
 def scene_from_intensities(intensities: Float[Array, "4 h w"]) -> PolarizationScene:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet import stokes
-from polarnet.pictures.images import read_rgb
+from polarnet.pictures.images import LIGHT, read_rgb
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, listed, read_manifest
 from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
@@ -22,7 +22,13 @@ from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation import scene as scene_module
 from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, channel_size, grid, mixed_with_neighbours
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
+from polarnet.simulation.scene import (
+    LIGHT_RANGE,
+    PolarizationScene,
+    logarithmic,
+    scene_from_polarization,
+    stretched,
+)
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import Contents, FrameStore, Polarization
 from polarnet.storage.scenes import SceneStore, as_stored
@@ -168,29 +174,37 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
     config, polarizers, valid = synthesis.motion, synthesis.polarizers, None
     t_us, pixels = frame_times_us(config), grid(polarizers.layout, config.sensor_height, config.sensor_width)
     for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
-        planes = _planes_of(name, picture, synthesis)
+        planes, dynamic_range = _planes_of(name, picture, synthesis)
         if not scenes.masked:
             planes = planes._replace(valid=None)
-        scene = stretched(scene_from_polarization(planes.s0, planes.dolp, planes.aolp), config.dynamic_range)
+        scene = stretched(scene_from_polarization(planes.s0, planes.dolp, planes.aolp), dynamic_range)
         for sequence, *_, trajectory in over_scene:
-            scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1])
+            scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1], dynamic_range)
             if planes.valid is not None:
                 valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.max_crosstalk)
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 
-def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> Polarization:
-    """Scene made from a picture, quantised as stored, so that events and truth are rendered from the same values."""
+def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> tuple[Polarization, float | None]:
+    """Scene made from a picture, quantised as stored, and the dynamic range to which `stretched` stretches it.
+
+    Events and truth are rendered from the same values.
+    """
     polarization, valid = _read_polarization(synthesis.images, picture)
     if synthesis.variation and scene != picture:
         polarization = varied(polarization, synthesis.variation, generator_for(synthesis.seed, scene, "variation"))
     s0, dolp, aolp = polarization
-    return as_stored(Polarization(s0, dolp, aolp, valid))
+    dynamic_range = synthesis.motion.dynamic_range
+    if (synthesis.images / f"{picture}{LIGHT}").exists():
+        s0, dynamic_range = logarithmic(s0, LIGHT_RANGE), LIGHT_RANGE
+    return as_stored(Polarization(s0, dolp, aolp, valid)), dynamic_range
 
 
 def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:
     """(S0, DoLP, AoLP) of a photograph or measurement, and the mask of known pixels (None: all are known)."""
-    measured = images / f"{picture}.npz"
+    measured, light = images / f"{picture}.npz", images / f"{picture}{LIGHT}"
+    if light.exists():
+        return scene_module.polarization_from_light(np.load(light).transpose(2, 0, 1)), None
     if not measured.exists():
         return scene_module.polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
     intensities, valid = read_intensities(measured)

@@ -89,11 +89,19 @@ class SceneStore(SplitStore):
             conventions=CONVENTIONS,
         )
 
-    def write(self, sequence: str, scene: Polarization, trajectory: Float64[Array, " k"], duration_us: int) -> None:
+    def write(
+        self,
+        sequence: str,
+        scene: Polarization,
+        trajectory: Float64[Array, " k"],
+        duration_us: int,
+        dynamic_range: float | None = None,
+    ) -> None:
         """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
 
-        Arrays may be numpy or torch. TypeError for anything but an array. ValueError for values out of range or not
-        finite, integers, planes of different shapes, a scene of an impossible size, or a mask in a store without one.
+        With a `dynamic_range`, S0 is logarithmic and spans it. Arrays may be numpy or torch. TypeError for anything but
+        an array. ValueError for values out of range or not finite, integers, planes of different shapes, a scene of an
+        impossible size, or a mask in a store without one.
         """
         names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
         if len(trajectory) != len(names) or not trajectory.isfinite().all():
@@ -105,6 +113,8 @@ class SceneStore(SplitStore):
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
+        if dynamic_range is not None:
+            record["dynamic_range"] = dynamic_range
         self.append(sequence, self._pixels(sequence, scene), record)
 
     def read(self, sequence: str) -> Polarization:
@@ -122,6 +132,10 @@ class SceneStore(SplitStore):
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
         return self.record(sequence)["duration_us"]
+
+    def dynamic_range(self, sequence: str) -> float | None:
+        """Brightest over darkest light of a scene whose S0 is logarithmic; None if S0 is the light itself."""
+        return self.record(sequence).get("dynamic_range")
 
     def _pixels(self, name: str, scene: Polarization) -> dict[str, np.ndarray]:
         """The columns of a scene; ValueError for a scene that the store cannot hold."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 import zarr
@@ -22,6 +23,7 @@ from polarnet.simulation import (
     SENSORS,
     Camera,
     scene_from_intensities,
+    scene_from_light,
     simulate,
 )
 from polarnet.simulation.camera import PERFECT
@@ -107,6 +109,20 @@ def test_a_photograph_gives_the_events_and_the_truth_of_simulate(tmp_path):
     turned = np.abs(truth["aolp"][:] * np.pi / 65536 - result.aolp.numpy())
     assert np.minimum(turned, np.pi - turned).max() < 1e-4
     np.testing.assert_allclose(truth["s0"][:] / 65535, result.intensities[:, ::2].sum(1), atol=2e-5)
+
+
+def test_the_dynamic_range_stretches_photographs_and_leaves_the_light_of_an_exr():
+    motion, sensor = replace(MOTION, dynamic_range=1000.0), replace(SENSORS["clean"], dark_dn=0.0)
+    options = [*SMALL, "--out", "out", "sensor=clean", "emulate.dark_dn=0.0", "synthesize.dynamic_range=1000.0"]
+    photograph = scenery(3, 60, 90)[0]
+    cv2.imwrite("lake.png", photograph)
+    assert main(["simulate", "lake.png", *options]) == 0
+    assert_equal(stored(), simulate(rgb(photograph[None])[0], motion, sensor, seed=1).events)
+    light = (10 ** (photograph / 20 - 6)).astype(np.float32)
+    assert oiio.ImageBuf(light).write("lake.exr")
+    assert main(["simulate", "lake.exr", *options]) == 0
+    scene = scene_from_light(torch.from_numpy(light / light.max()).permute(2, 0, 1).contiguous())
+    assert_equal(stored(), simulate(scene, MOTION, sensor, seed=1).events)
 
 
 def test_one_measurement_of_polarization_is_a_scene_under_a_moving_sensor():
