@@ -1,24 +1,21 @@
 """Charts of the pages in the pages' own colours (`polarnet.reports.figures.svg`), and the figure of a sweep."""
 
-import contextlib
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from polarnet.reports.artefacts import History, Results
+from polarnet.reports.artefacts import History
 from polarnet.reports.figures import LIGHT, PAGE, styled
-from polarnet.reports.legend import Legend, in_order, with_structure
-from polarnet.reports.tables import Column
+from polarnet.reports.legend import OTHER_COLOUR, Legend, in_order
+from polarnet.reports.tables import COLUMNS
 
 WIDTH, HEIGHT = 4.8, 2.8  # inches
-ROW_HEIGHT, LABEL_LETTERS = 0.26, 28  # of a method beside a chart: inches, and letters in a line of its label
+ROW_HEIGHT, LABEL_LETTERS = 0.26, 28  # of a label beside a chart: inches, and letters in a line of its label
 
 
 def _axes(height: float = HEIGHT) -> tuple[Figure, Axes]:
@@ -26,14 +23,23 @@ def _axes(height: float = HEIGHT) -> tuple[Figure, Axes]:
     return figure, figure.subplots()
 
 
-def _method_axes(labels: Sequence[str]) -> tuple[Figure, Axes]:
-    """Axes with a row for each label, the first at the top."""
+def _dots(
+    labels: Sequence[str],
+    means: Sequence[float],
+    intervals: Sequence[Sequence[float]],
+    colours: Sequence[str],
+    quantity: str,
+) -> Figure:
+    """A row for each label, the first at the top: a dot at its mean and a line over its interval."""
     figure, axes = _axes(0.5 + ROW_HEIGHT * len(labels))
+    for place, (mean, interval, colour) in enumerate(zip(means, intervals, colours, strict=True)):
+        axes.plot(interval, [place] * len(interval), color=colour)
+        axes.plot(mean, place, "o", color=colour, markersize=5)
     axes.set_yticks(range(len(labels)), [textwrap.fill(label, LABEL_LETTERS) for label in labels])
     axes.tick_params(axis="y", length=0)
-    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set(ylim=(len(labels) - 0.5, -0.5), xlabel=quantity)
     axes.spines["left"].set_visible(False)
-    return figure, axes
+    return figure
 
 
 def _above(figure: Figure) -> None:
@@ -61,15 +67,21 @@ def _diagonal(axes: Axes, values: Iterable[float]) -> None:
 
 
 @styled(PAGE)
-def score_chart(metrics: Mapping[str, Mapping[str, Any]], key: str, column: Column, legend: Legend) -> Figure:
-    """A score of each method that has it, with its 95 % interval."""
-    methods = [method for method in in_order(metrics) if metrics[method].get(key) is not None]
-    figure, axes = _method_axes([legend.label(method) for method in methods])
-    for place, method in enumerate(methods):
-        interval = metrics[method].get(f"{key}_ci") or []
-        axes.plot(interval, [place] * len(interval), color=legend.colour(method))
-        axes.plot(metrics[method][key], place, "o", color=legend.colour(method), markersize=5)
-    axes.set_xlabel(column.heading)
+def error_chart(metrics: Mapping[str, Mapping[str, Any]], legend: Legend) -> Figure:
+    """MSE of each method with its 95 % interval."""
+    methods = in_order(metrics)
+    means, intervals = ([metrics[method][key] for method in methods] for key in ("mse", "mse_ci"))
+    labels, colours = ([name(method) for method in methods] for name in (legend.label, legend.colour))
+    return _dots(labels, means, intervals, colours, COLUMNS["mse"].heading)
+
+
+@styled(LIGHT)
+def sweep_chart(points: Mapping[str, tuple[float, float]]) -> Figure:
+    """Validation MSE of the points of a sweep by their overrides: mean and standard deviation over seeds."""
+    means = [mean for mean, _ in points.values()]
+    intervals = [(mean - deviation, mean + deviation) for mean, deviation in points.values()]
+    figure = _dots([*points], means, intervals, [OTHER_COLOUR] * len(points), "validation MSE")
+    figure.set_facecolor(LIGHT.face)
     return figure
 
 
@@ -117,58 +129,3 @@ def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], leg
     axes.set(xlabel="expected squared error", ylabel="measured squared error")
     _above(figure)
     return figure
-
-
-@styled(PAGE)
-def sets_chart(sets: Sequence[Results], titles: Mapping[str, str], legend: Legend) -> Figure:
-    """Heat map: MSE of each method on each test set, divided by the best constant's; no tile without both."""
-    methods = with_structure(dict.fromkeys(method for one in sets for method in one.metrics))
-    errors = [[one.metrics.get(row, {}).get("mse") for one in sets] for row in [*methods, "oracle_mean"]]
-    known = np.array(errors, float)  # not a number where an error is unknown
-    ratios = known[:-1] / known[-1]
-    figure, axes = _method_axes([legend.label(method) for method in methods])
-    logarithms = np.log(ratios)
-    axes.imshow(logarithms, cmap="cividis_r", aspect="auto")
-    axes.set_xticks(range(len(sets)), [textwrap.fill(titles.get(one.name, one.name), 14) for one in sets])
-    axes.xaxis.tick_top()
-    axes.grid(visible=False)
-    middle = (np.nanmin(logarithms) + np.nanmax(logarithms)) / 2
-    for (row, column), ratio in np.ndenumerate(ratios):
-        if np.isfinite(ratio):
-            ink = "#ffffff" if logarithms[row, column] > middle else "#10141b"
-            axes.text(column, row, f"{ratio:.2f}", ha="center", va="center", color=ink)
-    return figure
-
-
-@styled(LIGHT)
-def parallel_coordinates(values: Mapping[str, Sequence[str]], scores: Sequence[float], score_label: str) -> Figure:
-    """One axis for each swept key and one for the score; the line of the lowest score is drawn last and thick.
-
-    `values` has a value for each point, by key. An axis spaces them evenly: numbers by size, words as they appear.
-    """
-    figure = Figure(figsize=(2.2 * (len(values) + 1), 3.6), layout="constrained", facecolor=LIGHT.face)
-    axes = figure.subplots()
-    colours, scaled = matplotlib.colormaps["viridis_r"], Normalize(min(scores), max(scores))
-    heights = [_height_of(column) for column in values.values()]
-    span = max(scores) - min(scores) or 1.0
-    for number in sorted(range(len(scores)), key=lambda number: -scores[number]):
-        levels = [height[column[number]] for height, column in zip(heights, values.values(), strict=True)]
-        levels.append((scores[number] - min(scores)) / span)
-        best = number == int(np.argmin(scores))
-        axes.plot(levels, color=colours(scaled(scores[number])), linewidth=3.0 if best else 1.3)
-    heights.append({f"{min(scores):.4f}": 0.0, f"{max(scores):.4f}": 1.0})
-    for place, height in enumerate(heights):
-        for value, level in height.items():
-            axes.text(place + 0.04, level, value, fontsize=8, va="bottom", color=LIGHT.text)
-    axes.set_xticks(range(len(values) + 1), [*values, score_label], fontsize=8)
-    axes.set(yticks=[], xlim=(-0.2, len(values) + 0.5))
-    axes.grid(axis="x")
-    return figure
-
-
-def _height_of(column: Sequence[str]) -> dict[str, float]:
-    """Place of each value on its axis, from 0 to 1."""
-    distinct = list(dict.fromkeys(column))
-    with contextlib.suppress(ValueError):
-        distinct.sort(key=float)
-    return {value: place / max(len(distinct) - 1, 1) for place, value in enumerate(distinct)}
