@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from polarnet.methods import METHODS, is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
 from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, training_history
-from polarnet.reports.charts import reliability_chart, scatter_chart, score_chart, sets_chart, training_chart
+from polarnet.reports.charts import error_chart, reliability_chart, scatter_chart, training_chart
 from polarnet.reports.figures import svg
 from polarnet.reports.legend import (
     LABELS,
@@ -28,7 +28,7 @@ from polarnet.reports.legend import (
 from polarnet.reports.maps import png
 from polarnet.reports.paper import comparison_figure, write_paper_files
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
-from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, paper_table, score_table
+from polarnet.reports.tables import COLUMNS, PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
 from polarnet.storage.scenes import SceneStore
 
 OURS = "ours"
@@ -122,8 +122,7 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "verdict": verdict(metrics, details, legend),
         "scores": set_table(metrics, warmup_windows=details["warmup_windows"]),
         "all_scores": score_table(metrics, labels=legend.labels),
-        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
-        "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
+        "parts_and_costs": score_table(metrics, PARTS_AND_COSTS, legend.labels),
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
         "glossary": glossary(metrics, details["weights"]),
@@ -137,7 +136,7 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
             }
             for one in others
         ],
-        "charts": _charts(sets, legend),
+        "charts": _charts(results, legend),
         "player_json": embedded_json(player_data(films)) if films else None,
         "script": script,
     }
@@ -146,19 +145,17 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
     return path
 
 
-def _charts(sets: Sequence[Results], legend: Legend) -> dict[str, Any]:
+def _charts(results: Results, legend: Legend) -> dict[str, Any]:
     """Charts of the results on a test set; None where there is nothing to show."""
-    metrics, details = sets[0].metrics, sets[0].details
+    metrics, details = results.metrics, results.details
     means = details["scene_means"].get("mse", {})
-    scored = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
     rival = _best_other(OURS, metrics) if OURS in means else None
     groups = {row: entry["curve"] for row, entry in details.get("reliability", {}).items()}
     curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
     return {
-        "scores": [svg(score_chart(metrics, key, PAGE_COLUMNS[key], legend)) for key in scored],
+        "errors": svg(error_chart(metrics, legend)),
         "scatter": None if rival is None else svg(scatter_chart(means, rival, legend)),
         "reliability": svg(reliability_chart(curves, legend)) if curves else None,
-        "sets": svg(sets_chart(sets, SET_TITLES, legend)) if len(sets) > 1 else None,
     }
 
 

@@ -13,7 +13,7 @@ from polarnet.reports.artefacts import Results
 from polarnet.reports.figures import LIGHT, show_picture, styled, tile_grid
 from polarnet.reports.legend import GENERAL, Legend, with_structure
 from polarnet.reports.maps import dolp_image, event_full_scale, event_image, write_figure
-from polarnet.reports.tables import COLUMNS, Row, Scores, Table, as_latex, as_markdown, score_table
+from polarnet.reports.tables import COLUMNS, Row, Scores, Table, as_latex, score_table
 from polarnet.storage.panels import Panel
 
 METHODS = ("cf", "e2v", "e2vid_published", "paper", "ours")
@@ -26,7 +26,7 @@ HEADING_LETTERS, NAME_LETTERS = 19, 18  # in a line above and beside a picture
 
 
 def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) -> None:
-    """Write figures 9 and 10 for the test sets with panels, and Table 2 (.md, .tex) if both sets were scored."""
+    """Write figures 9 and 10 for the test sets with panels, and Table 2 as LaTeX if both sets were scored."""
     sets = {one.name: one for one in results if one.name in EXPERIMENTS}
     for name, one in sets.items():
         if one.panels:
@@ -36,9 +36,7 @@ def write_paper_files(folder: Path, results: Sequence[Results], legend: Legend) 
         warmup_windows = sets["simulated"].details["warmup_windows"]
         table = table_2(sets["recordings"].metrics, sets["simulated"].metrics, legend, warmup_windows)
         folder.mkdir(parents=True, exist_ok=True)
-        for kind, written in (("md", as_markdown), ("tex", as_latex)):
-            text = written(table, tuple(EXPERIMENTS.values()))
-            (folder / f"table_2.{kind}").write_text(text + "\n", encoding="utf-8")
+        (folder / "table_2.tex").write_text(as_latex(table, [*EXPERIMENTS.values()]) + "\n", encoding="utf-8")
 
 
 def table_2(real: Scores, simulated: Scores, legend: Legend, warmup_windows: int) -> Table:
