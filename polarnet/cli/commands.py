@@ -267,8 +267,8 @@ def _fit_sensor(command: AddCommand) -> None:
         "fit the simulated sensor to a camera's recordings",
         "fit-sensor --name lab --static dark.raw --static-light 0 --moving walk.raw --frames frames/",
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
-        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws a page that "
-        "compares each recording with its simulated twin. docs/fit-sensor.md says what to record.",
+        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws each "
+        "recording beside its simulated twin. docs/fit-sensor.md says what to record.",
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
