@@ -76,7 +76,7 @@ def benchmarked(arguments: argparse.Namespace, weights: dict[str, Path]) -> dict
         "scenes": len(details["scenes"]),
         "frames": details["frames"],
         "rows": scores_and_costs(simulated),
-        "paired": {row: one["mse"] for row, one in details["paired"].items()},
+        "paired": details["paired"],
     }
 
 
