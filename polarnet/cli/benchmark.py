@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.analysis.conditions import announced, configured
+from polarnet.analysis.conditions import conditions, sentence, warnings
 from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
@@ -39,7 +39,6 @@ from polarnet.stokes import parse_mosaic
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
-SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
 PDAVIS = "90 45 / 135 0"
 PART = 2  # scenes
 NOT_ROTATING = "recordings hold the events of four channels, not those behind a rotating polarizer"
@@ -89,11 +88,12 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
-            used = configured(config.synthesize, config.emulate)
-            conditions = announced(used, metadata_used(methods, context), SET_THEM)
-            notes = _make_scenes(options, config, root, work)
+            used = conditions(config.synthesize, config.emulate)
+            about, differences = sentence(used), warnings(used, metadata_used(methods, context))
+            print("\n".join([about, *(f"WARNING: {line}" for line in differences)]), flush=True)
+            notes = [*differences, *_make_scenes(options, config, root, work)]
         else:
-            conditions = {"sentence": RECORDED_SENTENCE, "recorded": True, "warnings": []}
+            used, about = {}, RECORDED_SENTENCE
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
         notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
         rotating = None
@@ -112,12 +112,12 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             "lpips": NO_RECORD if weights is None else weights.record,
             "train_mean": context.train_mean,
             "weights": weights_used(methods, context),
-            "conditions": conditions,
+            "conditions": {"sentence": about, **used},
             "left_out": notes,
         }
         write_benchmark(folder, benchmark, settings, config.seed, details)
         command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
-        write_set_page(folder, test_set.name, command, [*conditions["warnings"], *notes])
+        write_set_page(folder, test_set.name, command, notes)
     return notes
 
 
