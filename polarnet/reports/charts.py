@@ -1,7 +1,7 @@
 """Charts of the pages in the pages' own colours (`polarnet.reports.figures.svg`), and the figure of a sweep."""
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from polarnet.reports.artefacts import History
 from polarnet.reports.figures import LIGHT, PAGE, styled
 from polarnet.reports.legend import OTHER_COLOUR, Legend, in_order
 from polarnet.reports.tables import COLUMNS
@@ -33,37 +32,13 @@ def _dots(
     """A row for each label, the first at the top: a dot at its mean and a line over its interval."""
     figure, axes = _axes(0.5 + ROW_HEIGHT * len(labels))
     for place, (mean, interval, colour) in enumerate(zip(means, intervals, colours, strict=True)):
-        axes.plot(interval, [place] * len(interval), color=colour)
+        axes.plot(interval, [place, place], color=colour)
         axes.plot(mean, place, "o", color=colour, markersize=5)
     axes.set_yticks(range(len(labels)), [textwrap.fill(label, LABEL_LETTERS) for label in labels])
     axes.tick_params(axis="y", length=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), xlabel=quantity)
     axes.spines["left"].set_visible(False)
     return figure
-
-
-def _above(figure: Figure) -> None:
-    """Put the legend above the axes."""
-    figure.legend(loc="outside upper left", ncols=2)
-
-
-def _logarithmic(axes: Axes, which: str) -> None:
-    """Make `which` of the axes x and y logarithmic, with plain numbers at 1, 2 and 5 of each decade."""
-    for name in which:
-        axes.set(**{f"{name}scale": "log"})
-        axis = axes.xaxis if name == "x" else axes.yaxis
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_locator(NullLocator())
-
-
-def _diagonal(axes: Axes, values: Iterable[float]) -> None:
-    """Logarithmic axes with equal ends, and the line on which both are equal."""
-    given = list(values)
-    ends = max(0.8 * min(given), 1e-6), 1.25 * max(given)
-    axes.plot(ends, ends, "--", color=PAGE.quiet, linewidth=1)
-    _logarithmic(axes, "xy")
-    axes.set(xlim=ends, ylim=ends)
 
 
 @styled(PAGE)
@@ -86,46 +61,21 @@ def sweep_chart(points: Mapping[str, tuple[float, float]]) -> Figure:
 
 
 @styled(PAGE)
-def scatter_chart(means: Mapping[str, Mapping[str, float]], rival: str, legend: Legend) -> Figure:
-    """MSE of ours against that of another method, a dot a scene; below the line ours is better.
-
-    `means` is method, then scene.
-    """
-    scenes = [scene for scene in means["ours"] if scene in means[rival]]
-    figure, axes = _axes()
-    _diagonal(axes, [means[method][scene] for method in ("ours", rival) for scene in scenes])
-    x, y = ([means[method][scene] for scene in scenes] for method in (rival, "ours"))
-    axes.plot(x, y, "o", color=legend.colour("ours"), markersize=4)
-    axes.set(xlabel=f"MSE of {legend.label(rival)}", ylabel="MSE of ours")
-    return figure
-
-
-@styled(PAGE)
-def training_chart(history: History, output: str) -> Figure:
-    """Loss terms, logarithmic if all are positive, and validation PSNR over epochs from 1."""
-    figure = Figure(figsize=(WIDTH, 1.7 * HEIGHT), layout="constrained", facecolor="none")
-    loss, psnr = figure.subplots(2, sharex=True, height_ratios=(3, 2))
-    for term, values in history.loss.items():
-        loss.plot(range(1, len(values) + 1), values, "o-", label=term.replace("_", " "))
-    if all(value > 0 for values in history.loss.values() for value in values):
-        _logarithmic(loss, "y")
-    validation = history.validation["psnr"]
-    psnr.plot(range(1, len(validation) + 1), validation, "o-")
-    loss.set_ylabel("training loss")
-    psnr.set(xlabel="epoch", ylabel=f"validation PSNR\nof {output}, dB")
-    _above(figure)
-    return figure
-
-
-@styled(PAGE)
 def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], legend: Legend) -> Figure:
     """Measured against expected squared error by method; dots grow with the number of pixels."""
     figure, axes = _axes()
-    _diagonal(axes, [end for curve in curves.values() for point in curve for end in point[:2]])
+    errors = [error for curve in curves.values() for point in curve for error in point[:2]]
+    ends = max(0.8 * min(errors), 1e-6), 1.25 * max(errors)
+    axes.plot(ends, ends, "--", color=PAGE.quiet, linewidth=1)
+    axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_locator(NullLocator())
     for method, curve in curves.items():
         expected, measured, pixels = np.array(curve).T
         axes.plot(expected, measured, color=legend.colour(method), label=legend.label(method))
         axes.scatter(expected, measured, 4 + 40 * pixels / pixels.max(), color=legend.colour(method))
     axes.set(xlabel="expected squared error", ylabel="measured squared error")
-    _above(figure)
+    figure.legend(loc="outside upper left", ncols=2)
     return figure

@@ -2,13 +2,10 @@ import re
 
 import pytest
 
-from polarnet.reports.artefacts import History
 from polarnet.reports.charts import (
     error_chart,
     reliability_chart,
-    scatter_chart,
     sweep_chart,
-    training_chart,
 )
 from polarnet.reports.figures import svg
 from polarnet.reports.legend import GENERAL
@@ -17,7 +14,6 @@ METRICS = {
     "oracle_mean": {"mse": 0.03, "mse_ci": [0.02, 0.04]},
     "ours": {"mse": 0.02, "mse_ci": [0.01, 0.03]},
 }
-MEANS = {"cf": {"lake": 0.2, "park": 0.1}, "ours": {"lake": 0.02, "park": 0.03}}
 
 
 def lines(axes):
@@ -31,18 +27,6 @@ def test_a_method_or_a_point_of_a_sweep_is_a_dot_on_its_interval():
     assert axes.get_yticklabels()[0].get_text() == "oracle mean"
     (axes,) = sweep_chart({"loss.ssim=0.0": (0.5, 0.25)}).axes
     assert lines(axes) == [[(0.25, 0), (0.75, 0)], [(0.5, 0)]]
-
-
-def test_every_scene_is_a_dot_and_the_diagonal_says_where_two_methods_are_equal():
-    diagonal, dots = lines(scatter_chart(MEANS, "cf", GENERAL).axes[0])
-    assert all(x == y for x, y in diagonal)
-    assert set(dots) == {(0.2, 0.02), (0.1, 0.03)}
-
-
-def test_epochs_of_a_training_count_from_one():
-    loss, psnr = training_chart(History("polarnet", {"mse": [0.3, 0.1]}, {"psnr": [9.0, 10.0]}, 1), "DoLP").axes
-    assert lines(loss) == [[(1, 0.3), (2, 0.1)]]
-    assert lines(psnr) == [[(1, 9.0), (2, 10.0)]]
 
 
 @pytest.mark.parametrize("figure", [

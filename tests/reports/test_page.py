@@ -42,7 +42,6 @@ def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the
     lower = r"\d+\xa0% lower than the best"
     assert re.search(rf"{lower} other method \(E2V: FireNet\) and {lower}", lead)
     assert lead.count(".") == 2  # the decimal point and the end
-    assert "MSE of E2V: FireNet" in page  # the axis of the scenes' chart
 
 
 def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(page):
@@ -56,8 +55,9 @@ def test_the_first_table_has_the_seven_scores_at_most_and_the_best_is_marked(pag
 @pytest.mark.parametrize(
     "texts",
     [
-        ("ours: the paper&#39;s network, events to DoLP", "E2V: FireNet, events to intensity"),  # trainings
-        ("<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use. The network of the paper",),
+        # trainings: epoch 2 of 3 has the smallest validation MSE, .04
+        ('">the paper&#39;s network</td>', '">FireNet</td>', 'Epochs">3</td>', 'Best epoch">2</td>', 'dB">11.00</td>'),
+        ("<dt>ours: the paper&#39;s network</dt><dd>The DoLP network in use.",),
         ("loss:\n  mse: 1.0", "lpips:\n  path:\n", "none: benchmark.lpips is false"),
         ("&lt;b&gt;Ann&lt;/b&gt;", "broken.jpg", "cannot be read: ends early"),
     ],
