@@ -4,8 +4,6 @@ import io
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +12,18 @@ from ruamel.yaml import YAML
 
 from polarnet.methods import is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
-from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, results_table
 from polarnet.reports.charts import error_chart, reliability_chart
 from polarnet.reports.figures import svg
-from polarnet.reports.legend import (
-    LABELS,
-    Legend,
-    glossary,
-    in_order,
-    legend_of,
-    network_label,
-    with_structure,
-)
+from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
 from polarnet.reports.maps import png
 from polarnet.reports.paper import comparison_figure, write_paper_files
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
-from polarnet.reports.tables import COLUMNS, PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
+from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import best_row, read_history
 
 OURS = "ours"
-HEADINGS = {
-    "mse": "MSE",
-    "psnr": "PSNR, dB",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "corr": "Correlation",
-    "aolp_deg": "AoLP error, °",
-    "ms_per_window": "Time, ms",
-}
-"""Columns of the first table; all others are one click away."""
-PAGE_COLUMNS = {key: replace(COLUMNS[key], label=heading) for key, heading in HEADINGS.items()}
 WORST_SCENES = 5
 MAX_FIGURE_PANELS = 4
 GENERATED = "dead_leaves"
@@ -114,7 +93,6 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
     films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
     names = [film.name for film in films]
     worst = sorted(means.get(method, {}).items(), key=lambda item: -item[1])[:WORST_SCENES]
-    set_table = partial(score_table, columns=PAGE_COLUMNS, labels=legend.labels)
     values = {
         "notes": [],
         "parameters": None,
@@ -122,8 +100,7 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "pictures": None,
         "details": details,
         "verdict": verdict(metrics, details, legend),
-        "scores": set_table(metrics, warmup_windows=details["warmup_windows"]),
-        "all_scores": score_table(metrics, labels=legend.labels),
+        "scores": results_table(results),
         "parts_and_costs": score_table(metrics, PARTS_AND_COSTS, legend.labels),
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
@@ -134,7 +111,7 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
                 "title": SET_TITLES.get(one.name, one.name),
                 "about": SET_ABOUT.get(one.name, ""),
                 "details": one.details,
-                "scores": set_table(one.metrics, warmup_windows=one.details["warmup_windows"]),
+                "scores": results_table(one),
             }
             for one in others
         ],
