@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from polarnet.config.origins import Run, Stage, digest
 from polarnet.config.sweep import FAILURE, mark_finished, why_unfinished
 from polarnet.config.tables import collect_rows
-from polarnet.config.tree import Config, check_ablation, hydra_command, or_exit, typed
+from polarnet.config.tree import Config, hydra_command, or_exit, typed
 from polarnet.runtime.files import claimed, code_digest
 from polarnet.runtime.machine import end_with_parent
 
@@ -42,13 +42,13 @@ CHANGES_NO_RESULT = ("paths", "runtime", "cluster", "row", "baseline")
 def main(node: DictConfig) -> None:
     """Run the stages of this point as child processes, unless its folder holds their results already."""
     hydra = HydraConfig.get()
-    job, overrides = Path(hydra.runtime.output_dir), list(hydra.overrides.task)
-    if not any(override.startswith("benchmark.methods=") for override in overrides):
+    job = Path(hydra.runtime.output_dir)
+    if not any(override.startswith("benchmark.methods=") for override in hydra.overrides.task):
         node.benchmark.methods = REFERENCE_METHODS
     with contextlib.ExitStack() as held:
         or_exit(lambda: held.enter_context(claimed(job)))
         (job / FAILURE).unlink(missing_ok=True)
-        failure = _failure_of_point(node, job, overrides)
+        failure = _failure_of_point(node, job)
     if failure:
         (job / FAILURE).write_text(f"{failure}\n")
         print(f"{job}: {failure}", file=sys.stderr)
@@ -56,11 +56,10 @@ def main(node: DictConfig) -> None:
             raise SystemExit(1)
 
 
-def _failure_of_point(node: DictConfig, job: Path, overrides: list[str]) -> str | None:
+def _failure_of_point(node: DictConfig, job: Path) -> str | None:
     """Run a point; return why it failed, or None."""
     try:
         config = typed(node)
-        check_ablation(ROOT, config, overrides)
     except ValueError as error:
         return str(error)
     run = Run(ROOT, config, "trial")

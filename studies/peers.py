@@ -4,22 +4,17 @@ python -m studies.peers --photographs FOLDER --work FOLDER
     [--ours FILE] [--published ROW=FILE ...] [--write]
 
 The study runs the pipeline's stages with experiment=photographs in the folder --work. An interrupted run resumes, and
-finished trainings are reused. The split is by source picture. --write puts the scores into docs/results/benchmark.json
-and draws docs/pictures/event_budget.png.
+finished trainings are reused. The split is by source picture. --write puts the scores into docs/results/benchmark.json.
 """
 
 import argparse
 import json
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from polarnet.config.tables import collect_rows
 from polarnet.config.tree import load
 from studies.study import (
-    PICTURES,
     ROOT,
     arguments_of,
     command_line,
@@ -40,8 +35,6 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 PUBLISHED = ("firenet_published", "cista_tc")
 SOLVED = [f"{row}{gain}" for row in ("cf", "highpass", *PUBLISHED, "e2v") for gain in ("", "+gain")]
 METHODS = ["zeros", "train_mean", "oracle_mean", *SOLVED, "e2p", "paper", "ours"]
-BUDGET_SEQUENCES = 6
-BUDGET_METHODS = ("oracle_mean", "highpass+gain", "ours")
 
 
 def common(arguments: argparse.Namespace) -> list[str]:
@@ -83,17 +76,8 @@ def benchmarked(arguments: argparse.Namespace, weights: dict[str, Path]) -> dict
         "scenes": len(details["scenes"]),
         "frames": details["frames"],
         "rows": scores_and_costs(simulated),
-        "paired": {row: one["mse"] for row, one in details["paired"].items()},
+        "paired": details["paired"],
     }
-
-
-def draw_event_budget(arguments: argparse.Namespace, weights: Path) -> None:
-    """Draw docs/pictures/event_budget.png, as `polarnet benchmark --event-budget` does."""
-    out = arguments.work / "event_budget"
-    asked = ["--event-budget", "--weights", weights, "--methods", ",".join(BUDGET_METHODS), "--out", out]
-    command = [sys.executable, "-m", "polarnet.cli", "benchmark", *asked, "--limit", str(BUDGET_SEQUENCES)]
-    subprocess.run([*map(str, command), *common(arguments)], cwd=ROOT, check=True)
-    shutil.copy(out / "event_budget.png", PICTURES / "event_budget.png")
 
 
 def main() -> None:
@@ -118,7 +102,6 @@ def main() -> None:
     print(json.dumps({row: one["mse"] for row, one in figures["rows"].items()}, indent=2))
     if arguments.write:
         write_section("benchmark", "simulated", figures, record)
-        draw_event_budget(arguments, weights["ours"])
 
 
 if __name__ == "__main__":

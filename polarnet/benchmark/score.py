@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from pydantic import Field, NonNegativeInt
 from torch import Tensor
 
@@ -180,15 +180,6 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
     }
 
 
-def mean_scores(rows: Sequence[FrameScore], metrics: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Mean over scenes by method and metric; a method lacks the metrics that were not computed for it."""
-    means = {metric: scene_means(rows, metric) for metric in metrics}
-    return {
-        method: {name: float(np.mean([*of[method].values()])) for name, of in means.items() if method in of}
-        for method in dict.fromkeys(row.method for row in rows)
-    }
-
-
 def summary(
     rows: Sequence[FrameScore], bootstrap_samples: int, seed: int
 ) -> dict[str, dict[str, float | list[float] | None]]:
@@ -218,63 +209,37 @@ def summary(
     return table
 
 
-PAIRED_METRICS = {
-    "mse": "low", "psnr": "high", "ssim": "high", "lpips": "low", "corr": "high", "grad": "high",
-    "pattern_mse": "low", "aolp_deg": "low",
-}  # fmt: skip
-"""Metrics to compare, and whether lower or higher is better."""
-
-
-def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """Compare `method` with every other method in `rows`, metric by metric; empty if `rows` lack `method`.
+def paired_comparisons(rows: Iterable[FrameScore], method: str) -> dict[str, dict[str, Any]]:
+    """Compare the MSE of `method` with that of every other method in `rows`; empty if `rows` lack `method`.
 
     Each scene gives one pair: the two methods' means over its frames. A comparison holds
 
-    - `scenes`: number of scenes, and `better`: number of scenes where `method` is better;
-    - `median_difference`: `method` minus the other method, in the unit of the metric;
-    - `effect`: rank-biserial correlation of the pairs (Kerby, Comprehensive Psychology 2014): 1 if `method` is better
-      in every scene, -1 if it is worse in every scene, 0 if neither stands out;
+    - `scenes`: number of scenes, and `better`: number of scenes where `method` has the smaller error;
+    - `median_difference`: `method` minus the other method;
     - `p`: two-sided p-value of Wilcoxon's signed-rank test (exact up to 50 scenes without ties), and `p_holm`: the
       same after Holm's correction (1979) for the number of other methods.
 
     The test has little power with few scenes: with five, the smallest possible p is 0.0625.
     """
-    rows = list(rows)
-    means = {metric: scene_means(rows, metric) for metric in PAIRED_METRICS}
-    rivals = [name for name in dict.fromkeys(row.method for row in rows) if name != method]
-    table: dict[str, dict[str, dict[str, Any]]] = {rival: {} for rival in rivals}
-    for metric, better in PAIRED_METRICS.items():
-        of = means[metric]
-        if method not in of:
-            continue
-        for rival in [name for name in rivals if name in of]:
-            difference = np.array([value - of[rival][scene] for scene, value in of[method].items()])
-            table[rival][metric] = compared(difference if better == "high" else -difference) | {
-                "median_difference": float(np.median(difference))
-            }
-        _correct([table[rival][metric] for rival in rivals if metric in table[rival]])
-    return {rival: scores for rival, scores in table.items() if scores}
+    from scipy.stats import wilcoxon  # a second, which every stage would pay
 
-
-def compared(gains: Float64[np.ndarray, " scenes"]) -> dict[str, Any]:
-    """`scenes`, `better`, `effect` and `p` from the gain in each scene; a gain of 0 counts for neither method."""
-    from scipy.stats import rankdata, wilcoxon  # a second, which every stage would pay
-
-    moved = gains[gains != 0]
-    effect, p = 0.0, 1.0
-    if len(moved):
-        ranks = rankdata(np.abs(moved))
-        effect = float((ranks * np.sign(moved)).sum() / ranks.sum())
-        p = float(wilcoxon(moved).pvalue)
-    return {"scenes": len(gains), "better": int((gains > 0).sum()), "effect": effect, "p": p}
-
-
-def _correct(comparisons: Sequence[dict[str, Any]]) -> None:
-    """Add `p_holm`: the k-th smallest of n p-values times n + 1 - k, at most 1 and never decreasing in k."""
+    errors = scene_means(rows, "mse")
+    own = errors.pop(method, {})
+    table: dict[str, dict[str, Any]] = {}
+    for rival, others in errors.items() if own else ():
+        difference = np.array([error - others[scene] for scene, error in own.items()])
+        moved = difference[difference != 0]
+        table[rival] = {
+            "scenes": len(difference),
+            "better": int((difference < 0).sum()),
+            "median_difference": float(np.median(difference)),
+            "p": float(wilcoxon(moved).pvalue) if len(moved) else 1.0,
+        }
     reached = 0.0
-    for i, comparison in enumerate(sorted(comparisons, key=lambda comparison: comparison["p"])):
-        reached = max(reached, min(1.0, comparison["p"] * (len(comparisons) - i)))
+    for i, comparison in enumerate(sorted(table.values(), key=lambda comparison: comparison["p"])):
+        reached = max(reached, min(1.0, comparison["p"] * (len(table) - i)))
         comparison["p_holm"] = reached
+    return table
 
 
 def _skill(error: Any, oracle: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
+"""`polarnet benchmark`: methods on a folder of your own, without training.
 
 Scenes and events of a user's folder stay in `work` of the output: a second run only runs the methods.
 """
@@ -11,16 +11,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.analysis.conditions import announced, configured
+from polarnet.analysis.conditions import conditions, sentence, warnings
 from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
-from polarnet.cli.options import CLEANING, cleaning_of, given
-from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.cli.project import project_root, settings_root, working_folder
-from polarnet.cli.studies import STUDIED, run_event_budget
+from polarnet.cli.options import CLEANING, cleaning_of, refuse
+from polarnet.cli.outputs import WORK, run_folder
+from polarnet.cli.project import settings_root, working_folder
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load, with_lpips
 from polarnet.methods import is_rotating
@@ -40,7 +39,6 @@ from polarnet.stokes import parse_mosaic
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
-SET_THEM = "To score on sequences like those of the training, add to the command, or write into params.yaml:"
 PDAVIS = "90 45 / 135 0"
 PART = 2  # scenes
 NOT_ROTATING = "recordings hold the events of four channels, not those behind a rotating polarizer"
@@ -48,33 +46,23 @@ RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarizat
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score methods on a folder or study the pipeline's sequences; print the table or the files."""
-    own = options.scenes or options.recordings
-    if options.recordings and options.limit is not None:
-        raise ValueError("--limit does not apply to --recordings; leave it out")
+    """Score methods on a folder, write scores and page, and print the table."""
+    if options.recordings:
+        refuse(options, "--recordings", ["limit"])
+    else:
+        refuse(options, "--scenes", ["mosaic", *CLEANING])
     if options.limit is not None and options.limit < 1:
         raise ValueError(f"--limit: expected at least 1, got {options.limit}")
-    if not options.recordings and (listed := given(options, ["mosaic", *CLEANING])):
-        raise ValueError(f"{listed}: apply to --recordings only; leave it out")
-    settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
-    folder = working_folder()
-    name = own.resolve().name if own else "event_budget"
-    options.out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
+    settings, folder = settings_root(), working_folder()
+    root, cleaning = (options.scenes or options.recordings).resolve(), cleaning_of(options)
+    options.out = (options.out or folder / "outputs" / "benchmark" / root.name).resolve()
     options.weights = options.weights and options.weights.resolve()
-    root, cleaning = own and own.resolve(), cleaning_of(options)
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
-        chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
+        chosen = [f"benchmark.methods=[{options.methods}]"] if options.methods else []
         # all cores, and small parts, which share few scenes evenly among them; an override replaces both
-        shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"] if own else []
+        shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"]
         config = load(settings, [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
-        if root is None:
-            with run_folder(options.out, "benchmark --event-budget") as study:
-                methods = options.methods.split(",") if options.methods else STUDIED
-                run_event_budget(config, study, methods, options.limit, options.weights)
-            files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
-            print(f"wrote to {options.out}: {', '.join(files)}")
-            return
         notes = _score_folder(options, config, root, cleaning)
     print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")
@@ -100,11 +88,12 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
-            used = configured(config.synthesize, config.emulate)
-            conditions = announced(used, metadata_used(methods, context), SET_THEM)
-            notes = _make_scenes(options, config, root, work)
+            used = conditions(config.synthesize, config.emulate)
+            about, differences = sentence(used), warnings(used, metadata_used(methods, context))
+            print("\n".join([about, *(f"WARNING: {line}" for line in differences)]), flush=True)
+            notes = [*differences, *_make_scenes(options, config, root, work)]
         else:
-            conditions = {"sentence": RECORDED_SENTENCE, "recorded": True, "warnings": []}
+            used, about = {}, RECORDED_SENTENCE
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
         notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
         rotating = None
@@ -123,12 +112,12 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             "lpips": NO_RECORD if weights is None else weights.record,
             "train_mean": context.train_mean,
             "weights": weights_used(methods, context),
-            "conditions": conditions,
+            "conditions": {"sentence": about, **used},
             "left_out": notes,
         }
         write_benchmark(folder, benchmark, settings, config.seed, details)
         command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
-        write_set_page(folder, test_set.name, command, [*conditions["warnings"], *notes])
+        write_set_page(folder, test_set.name, command, notes)
     return notes
 
 

@@ -11,7 +11,8 @@ from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.events.stream import Events
 from polarnet.recordings.recording import read_recording
-from polarnet.reports.realism import realism_page
+from polarnet.reports.maps import png
+from polarnet.reports.realism import realism_figure
 from polarnet.simulation.presets import SENSORS
 
 WRITTEN_BY = "# Written by `polarnet fit-sensor`"
@@ -35,7 +36,7 @@ UNITS = {
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit, print the table, and write the sensor and the page."""
+    """Fit, print the table, write the sensor, and draw each recording beside its twin."""
     check_options(options)
     preset = _preset_path(options.name)
 
@@ -74,11 +75,12 @@ def run(options: argparse.Namespace) -> None:
     comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
     for comparison in comparisons:
         print(f"{comparison.name}: {comparison.verdict}")
-    page = Path("outputs", "fit-sensor", f"{options.name}.html")
-    page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(realism_page(options.name, rows, notes, comparisons), encoding="utf-8")
     print(f"sensor      {preset} (use it with sensor={options.name})")
-    print(f"page        {page}")
+    if comparisons:
+        picture = Path("outputs", "fit-sensor", f"{options.name}.png")
+        picture.parent.mkdir(parents=True, exist_ok=True)
+        picture.write_bytes(png(realism_figure(comparisons)))
+        print(f"picture     {picture}")
 
 
 def check_options(options: argparse.Namespace) -> None:

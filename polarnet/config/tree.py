@@ -11,13 +11,12 @@ from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from polarnet.benchmark.rows import ROWS
 from polarnet.benchmark.score import BenchmarkConfig
 from polarnet.captures.dot import RecordingsConfig
-from polarnet.config.experiments import check_overrides, preset_values
+from polarnet.config.experiments import check_overrides
 from polarnet.config.origins import Run
 from polarnet.methods import METHODS
 from polarnet.methods.method import GainConfig, SharpeningConfig
@@ -277,7 +276,7 @@ def typed(node: DictConfig) -> Config:
 def load(root: Path, overrides: list[str] | None = None, presets: Path | None = None) -> Config:
     """Load the configuration of the project at `root`; overrides may also choose presets from conf/ of `presets`.
 
-    ValueError for an unknown key, an invalid value, or an ablation that changes nothing.
+    ValueError for an unknown key or an invalid value.
     """
     overrides = overrides or []
     check_overrides(Config, root, overrides, presets)
@@ -285,9 +284,7 @@ def load(root: Path, overrides: list[str] | None = None, presets: Path | None = 
     if presets and presets != root and (presets / "conf").is_dir():
         overrides = [*overrides, f"hydra.searchpath=['file://{root}','file://{presets / 'conf'}']"]
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(root / "conf")):
-        config = typed(hydra.compose("config", overrides=overrides))
-        check_ablation(root, config, overrides)
-    return config
+        return typed(hydra.compose("config", overrides=overrides))
 
 
 def hydra_stage(main: Stage) -> Callable[[], None]:
@@ -300,7 +297,6 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     @functools.wraps(main)
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
-        or_exit(lambda: check_ablation(root, config, list(HydraConfig.get().overrides.task)))
         or_exit(lambda: _check_lpips(config))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
@@ -387,33 +383,6 @@ def _check_lpips(config: Config) -> None:
 
     for purpose in PURPOSES:
         with_lpips(config, purpose, functools.partial(look, purpose))
-
-
-def check_ablation(root: Path, config: Config, overrides: list[str]) -> None:
-    """Raise ValueError if the chosen ablation changes no setting in use.
-
-    The exception is `nothing`, the baseline of a sweep. Hydra must be initialised before the call.
-    """
-    chosen = dict(override.split("=", 1) for override in overrides if "=" in override)
-    name = chosen.get("ablation", "null").strip("'\"")
-    if name in ("null", "nothing"):
-        return
-    others = [override for override in overrides if not override.startswith("ablation=")]
-    without = typed(hydra.compose("config", overrides=others))
-    if _in_use(config) != _in_use(without):
-        return
-    experiment = f"experiment={chosen['experiment']}" if "experiment" in chosen else "params.yaml"
-    values = ", ".join(f"{key}={value}" for key, value in preset_values(root, "ablation", name).items())
-    raise ValueError(
-        f"ablation={name} changes nothing: {values} stands already in {experiment}, or is of another network than "
-        f"{config.network}; choose another ablation"
-    )
-
-
-def _in_use(config: Config) -> tuple[Any, ...]:
-    """All settings except the sections of networks that are not in use."""
-    sections = [getattr(config, field.name) for field in dataclasses.fields(config) if field.name != "networks"]
-    return (*sections, config.network_config)
 
 
 def or_exit(check: Callable[[], T]) -> T:

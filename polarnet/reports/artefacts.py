@@ -13,7 +13,6 @@ from polarnet.reports.legend import legend_of
 from polarnet.reports.tables import Table, score_table
 from polarnet.runtime.machine import usable_cores
 from polarnet.storage.panels import Panel, read_panel
-from polarnet.training.engine.recorder import best_row, read_history
 
 SIMULATED = "simulated"  # name of the pipeline's own test set
 
@@ -32,18 +31,6 @@ class ReportPaths:
     def simulated(self) -> Path:
         """Results on the simulated test set."""
         return self.benchmark / "sets" / SIMULATED
-
-
-class History(NamedTuple):
-    """Training curves of one network; epochs count from 0."""
-
-    network: str
-    """Name of the network in its checkpoint."""
-    loss: Mapping[str, Sequence[float]]
-    """Mean of each loss term in each epoch."""
-    validation: Mapping[str, Sequence[float]]
-    """Validation scores of each epoch."""
-    best_epoch: int
 
 
 class Results(NamedTuple):
@@ -69,15 +56,6 @@ def results_table(results: Results) -> Table:
     """The scores of a test set, with labels that name the networks and a note on the windows that count."""
     labels, warmup_windows = legend_of(results.details["weights"]).labels, results.details["warmup_windows"]
     return score_table(results.metrics, labels=labels, warmup_windows=warmup_windows)
-
-
-def training_history(folder: Path) -> History:
-    """Mean loss terms and validation scores per epoch of a training, and the name of its network."""
-    rows = read_history(folder)
-    loss, validation = (
-        {name: [row[split][name] for row in rows] for name in rows[0][split]} for split in ("train", "val")
-    )
-    return History(_json(folder / "best.json")["network"], loss, validation, rows.index(best_row(rows)))
 
 
 def _json(path: Path) -> Any:

@@ -15,28 +15,16 @@ LABELS: Mapping[str, str] = {name: row.label for name, row in ROWS.items()}
 
 
 class Network(NamedTuple):
-    """Label, colour and description of a network in tables, figures and the glossary."""
+    """Label and colour of a network in tables and figures."""
 
     label: str
     colour: str
-    about: str
 
 
-RECONSTRUCTS = "a recurrent network from events to intensity, one polarizer at a time, then DoLP by the Stokes formula."
-NETWORKS = {
-    name: Network(METHODS[name].label, METHODS[name].colour, METHODS[name].about)
-    for name in ("paper", "e2p", "cista_tc")
-} | {
-    "polarnet": Network(
-        "polarnet's network",
-        METHODS["ours"].colour,
-        "Polarnet's own network: event counts of the four polarizers in, DoLP, AoLP and the expected error of DoLP "
-        "out. It solves the redundancy of the four polarizers and refines the answer with a small recurrent U-Net.",
-    ),
-    "e2vid": Network("E2VID", METHODS["e2vid_published"].colour, f"E2VID (Rebecq et al. 2019), {RECONSTRUCTS}"),
-    "firenet": Network(
-        "FireNet", METHODS["firenet_published"].colour, f"FireNet (Scheerlinck et al. 2020), {RECONSTRUCTS}"
-    ),
+NETWORKS = {name: Network(METHODS[name].label, METHODS[name].colour) for name in ("paper", "e2p", "cista_tc")} | {
+    "polarnet": Network("polarnet's network", METHODS["ours"].colour),
+    "e2vid": Network("E2VID", METHODS["e2vid_published"].colour),
+    "firenet": Network("FireNet", METHODS["firenet_published"].colour),
 }
 """Networks by their name in a checkpoint."""
 
@@ -101,23 +89,9 @@ def network_label(network: str) -> str:
     return NETWORKS[network].label if network in NETWORKS else network
 
 
-def glossary(methods: Iterable[str], weights: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """Term and explanation of each row of a benchmark, in table order; all rows with solved gains share one entry."""
-    rows, legend = in_order(methods), legend_of(weights)
-    entries = [
-        (legend.label(row), _about(row, weights.get(row)))
-        for row in dict.fromkeys(method.removesuffix(GAIN) for method in rows)
-        if row in weights or (row in ROWS and ROWS[row].about and (row not in METHODS or not METHODS[row].networks))
-    ]
-    return entries + ([("gains solved", GAINS)] if any(method.endswith(GAIN) for method in rows) else [])
-
-
-def _about(row: str, file: Mapping[str, Any] | None) -> str:
-    """Description of a row, followed by that of its network if it has one."""
-    about = ROWS[row].about if row in ROWS else ""
-    if file is None:
-        return about
-    if network := NETWORKS.get(file["network"]):
-        about = network.about if row in NETWORKS else f"{about} {network.about}".lstrip()
-    origin = "trained by polarnet" if file["file"].endswith(".safetensors") else "as its authors published them"
-    return f"{about} Weights: {file['file']}, {origin}.".lstrip()
+def glossary(methods: Iterable[str], legend: Legend) -> list[tuple[str, str]]:
+    """Label and description of the rows of a benchmark that have one; rows with solved gains share an entry."""
+    rows = in_order(methods)
+    described = [row for row in rows if row in ROWS and ROWS[row].about and not row.endswith(GAIN)]
+    entries = [(legend.label(row), ROWS[row].about) for row in described]
+    return entries + ([("gains solved", GAINS)] if any(row.endswith(GAIN) for row in rows) else [])

@@ -1,48 +1,29 @@
 """Self-contained HTML pages: the report of a pipeline run, and the page of one test set (`polarnet benchmark`)."""
 
 import io
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
 from ruamel.yaml import YAML
 
-from polarnet.methods import METHODS, is_rotating
+from polarnet.methods import is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
-from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, training_history
-from polarnet.reports.charts import reliability_chart, scatter_chart, score_chart, sets_chart, training_chart
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, results_table
+from polarnet.reports.charts import error_chart, reliability_chart
 from polarnet.reports.figures import svg
-from polarnet.reports.legend import (
-    LABELS,
-    NAMED_BY_NETWORK,
-    Legend,
-    glossary,
-    in_order,
-    legend_of,
-    network_label,
-    with_structure,
-)
+from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
 from polarnet.reports.maps import png
 from polarnet.reports.paper import comparison_figure, write_paper_files
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
-from polarnet.reports.tables import COLUMNS, COSTS, ERROR_PARTS, SET_TITLES, Scores, paper_table, score_table
+from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
 from polarnet.storage.scenes import SceneStore
+from polarnet.training.engine.recorder import best_row, read_history
 
 OURS = "ours"
-HEADINGS = {
-    "mse": "MSE",
-    "psnr": "PSNR, dB",
-    "ssim": "SSIM",
-    "lpips": "LPIPS",
-    "corr": "Correlation",
-    "aolp_deg": "AoLP error, °",
-    "ms_per_window": "Time, ms",
-}
-"""Columns of the first table; all others are one click away."""
-PAGE_COLUMNS = {key: replace(COLUMNS[key], label=heading) for key, heading in HEADINGS.items()}
 WORST_SCENES = 5
 MAX_FIGURE_PANELS = 4
 GENERATED = "dead_leaves"
@@ -112,7 +93,6 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
     films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
     names = [film.name for film in films]
     worst = sorted(means.get(method, {}).items(), key=lambda item: -item[1])[:WORST_SCENES]
-    set_table = partial(score_table, columns=PAGE_COLUMNS, labels=legend.labels)
     values = {
         "notes": [],
         "parameters": None,
@@ -120,24 +100,23 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "pictures": None,
         "details": details,
         "verdict": verdict(metrics, details, legend),
-        "scores": set_table(metrics, warmup_windows=details["warmup_windows"]),
-        "all_scores": score_table(metrics, labels=legend.labels),
-        "error_parts": score_table(metrics, columns=ERROR_PARTS, labels=legend.labels),
-        "costs": score_table(metrics, columns=COSTS, labels=legend.labels),
+        "scores": results_table(results),
+        "parts_and_costs": score_table(metrics, PARTS_AND_COSTS, legend.labels),
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
-        "glossary": glossary(metrics, details["weights"]),
+        "glossary": glossary(metrics, legend),
         "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
         "sets": [
             {
                 "title": SET_TITLES.get(one.name, one.name),
                 "about": SET_ABOUT.get(one.name, ""),
                 "details": one.details,
-                "scores": set_table(one.metrics, warmup_windows=one.details["warmup_windows"]),
+                "scores": results_table(one),
             }
             for one in others
         ],
-        "charts": _charts(sets, legend),
+        "errors": svg(error_chart(metrics, legend)),
+        "reliability": _reliability(details, legend),
         "player_json": embedded_json(player_data(films)) if films else None,
         "script": script,
     }
@@ -146,20 +125,11 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
     return path
 
 
-def _charts(sets: Sequence[Results], legend: Legend) -> dict[str, Any]:
-    """Charts of the results on a test set; None where there is nothing to show."""
-    metrics, details = sets[0].metrics, sets[0].details
-    means = details["scene_means"].get("mse", {})
-    scored = [key for key in PAGE_COLUMNS if any(row.get(key) is not None for row in metrics.values())]
-    rival = _best_other(OURS, metrics) if OURS in means else None
+def _reliability(details: Mapping[str, Any], legend: Legend) -> Markup | None:
+    """Chart of the expected errors on a test set; None if no method predicts them."""
     groups = {row: entry["curve"] for row, entry in details.get("reliability", {}).items()}
     curves = {row: known for row, curve in groups.items() if (known := [one for one in curve if min(one[:2]) > 0])}
-    return {
-        "scores": [svg(score_chart(metrics, key, PAGE_COLUMNS[key], legend)) for key in scored],
-        "scatter": None if rival is None else svg(scatter_chart(means, rival, legend)),
-        "reliability": svg(reliability_chart(curves, legend)) if curves else None,
-        "sets": svg(sets_chart(sets, SET_TITLES, legend)) if len(sets) > 1 else None,
-    }
+    return svg(reliability_chart(curves, legend)) if curves else None
 
 
 def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
@@ -212,19 +182,11 @@ def _pictures(manifest: Manifest) -> dict[str, Any]:
     }
 
 
-def _training(folder: Path, name: str) -> dict[str, Any]:
-    """Template values of a training."""
-    history = training_history(folder / name)
-    row = f"{LABELS[name]}: " if name in NAMED_BY_NETWORK else ""
-    output = "DoLP" if name == OURS else "intensity" if METHODS[name].reconstructs else "polarization"
-    psnr = history.validation["psnr"]
-    return {
-        "title": f"{row}{network_label(history.network)}, events to {output}",
-        "chart": svg(training_chart(history, output)),
-        "epochs": len(psnr),
-        "best_epoch": history.best_epoch + 1,
-        "best_psnr": psnr[history.best_epoch],
-    }
+def _training(folder: Path, name: str) -> tuple[str, str, int, int, str]:
+    """Row of the table of trainings: the row of the benchmark, network, epochs, and best epoch with its PSNR."""
+    rows, network = read_history(folder / name), json.loads((folder / name / "best.json").read_text())["network"]
+    best = best_row(rows)
+    return LABELS[name], network_label(network), len(rows), rows.index(best) + 1, f"{best['val']['psnr']:.2f}"
 
 
 def _as_yaml(values: Mapping[str, Any]) -> str:

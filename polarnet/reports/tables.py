@@ -1,4 +1,4 @@
-"""Benchmark scores as tables: selected, rounded and ranked once, then written as Markdown, plain text or HTML."""
+"""Benchmark scores as tables: selected, rounded and ranked once, then written as plain text, LaTeX or HTML."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +18,8 @@ class Column:
     label: str
     decimals: int
     better: Literal["low", "high"]
-    ranked: bool
-    """Whether the best value is set in bold; speeds are not ranked."""
-    unit: str
+    ranked: bool = True
+    """Whether the best value is set in bold; costs are not ranked."""
 
     @property
     def heading(self) -> str:
@@ -29,33 +28,27 @@ class Column:
 
     def printed(self, value: float | int) -> str:
         """A value with the decimals of its column; a value that rounds to 0 has no sign."""
-        text = f"{value:.{self.decimals}f}"
-        return text.removeprefix("-") if float(text) == 0 else text
+        return f"{value:z.{self.decimals}f}"
 
 
 COLUMNS: Mapping[str, Column] = {
-    "mse": Column("MSE", 4, "low", True, ""),
-    "psnr": Column("PSNR", 2, "high", True, " dB"),
-    "ssim": Column("SSIM", 4, "high", True, ""),
-    "lpips": Column("LPIPS", 4, "low", True, ""),
-    "corr": Column("corr.", 3, "high", True, ""),
-    "grad": Column("edges", 3, "high", True, ""),
-    "aolp_deg": Column("AoLP err.", 1, "low", True, "°"),
-    "skill": Column("skill", 3, "high", True, ""),
-    "ms_per_window": Column("ms / window", 1, "low", False, " ms"),
+    "mse": Column("MSE", 4, "low"),
+    "psnr": Column("PSNR", 2, "high"),
+    "ssim": Column("SSIM", 4, "high"),
+    "lpips": Column("LPIPS", 4, "low"),
+    "corr": Column("corr.", 3, "high"),
+    "grad": Column("edges", 3, "high"),
+    "aolp_deg": Column("AoLP err.", 1, "low"),
+    "skill": Column("skill", 3, "high"),
+    "ms_per_window": Column("ms / window", 1, "low", False),
 }
-ERROR_PARTS = {
-    "mse": COLUMNS["mse"],
-    "level_mse": Column("level", 4, "low", True, ""),
-    "pattern_mse": Column("pattern", 4, "low", True, ""),
+PARTS_AND_COSTS = {
+    "level_mse": Column("level", 4, "low"),
+    "pattern_mse": Column("pattern", 4, "low"),
+    "gflop": Column("GFLOP / window", 2, "low", False),
+    "params": Column("parameters", 0, "low", False),
 }
-"""MSE split in two: level, the squared error of the frame's mean, and pattern, the remainder."""
-COSTS = {
-    "ms_per_window": COLUMNS["ms_per_window"],
-    "gflop": Column("GFLOP / window", 2, "low", False, " GFLOP"),
-    "params": Column("parameters", 0, "low", False, ""),
-}
-"""Costs of a method on the machine of the run."""
+"""Parts of the MSE (level, the squared error of the frame's mean, and pattern, the remainder), and costs."""
 
 SET_TITLES = {
     "simulated": "Simulated",
@@ -92,8 +85,6 @@ class Cell(NamedTuple):
     """One value of a table."""
 
     text: str
-    interval: str
-    """95 % interval; empty if there is none."""
     best: bool
     """Whether no ranked row has a better value in this column; all ties are best."""
 
@@ -158,26 +149,11 @@ def paper_table(experiment: Literal["simulated", "real"]) -> Table:
     return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
-def as_markdown(table: Table, groups: Sequence[str] = ()) -> str:
-    """A GitHub table: best values in bold, intervals small below their values, notes at the end.
-
-    `groups` split the columns into equal runs, left to right; a heading starts with the name of its group.
-    """
-    width = len(table.headings) // max(1, len(groups))
-    headings = [f"{groups[k // width]} {one}" if groups else one for k, one in enumerate(table.headings)]
-    lines = ["| | " + " | ".join(headings) + " |", "|---|" + "---:|" * len(headings)]
-    for row in table.rows:
-        cells = (
-            (f"**{cell.text}**" if cell.best else cell.text)
-            + (f"<br><sub>{cell.interval}</sub>" if cell.interval else "")
-            for cell in row.cells
-        )
-        lines.append(f"| {row.label} | " + " | ".join(cells) + " |")
-    return "\n".join(lines + [f"\n{note}" for note in table.notes])
-
-
 def as_latex(table: Table, groups: Sequence[str] = ()) -> str:
-    """A LaTeX tabular for booktabs: best values in bold, notes as comments; `groups` as in `as_markdown`."""
+    """A LaTeX tabular for booktabs: best values in bold, notes as comments.
+
+    `groups` are headings above equal runs of columns, left to right.
+    """
     width = len(table.headings) // max(1, len(groups))
     lines = [rf"% {note}" for note in table.notes]
     lines += [rf"\begin{{tabular}}{{l{'r' * len(table.headings)}}}", r"\toprule"]
@@ -214,7 +190,6 @@ def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
 
 def _cell(column: Column, key: str, scores: Mapping[str, Any], best: str | None) -> Cell:
     if (value := scores.get(key)) is None:
-        return Cell("-", "", False)
-    interval = " to ".join(column.printed(end) for end in scores.get(f"{key}_ci") or ())
+        return Cell("-", False)
     text = column.printed(value)
-    return Cell(text, interval, text == best)
+    return Cell(text, text == best)

@@ -1,7 +1,6 @@
 """Sections of params.yaml as classes: pydantic checks the names, types and ranges of their values."""
 
 import dataclasses
-import difflib
 import functools
 import types
 import typing
@@ -24,7 +23,6 @@ EXPECTED = {
 """Expected values by pydantic's type of error; other types have a message of pydantic's own."""
 MAX_NUMBER = 1e10
 """Larger values than this are mistakes in any section; keys with a meaningful limit have their own."""
-CLOSE = 0.85  # similarity of names, 1 for equal ones, from which a mistyped key is likely
 
 Section = TypeVar("Section")
 
@@ -91,8 +89,7 @@ def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
         if name not in names:
             inside = ".".join(path[:depth]) or "the configuration"
             keys = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
-            close = " or ".join(difflib.get_close_matches(name, names, cutoff=CLOSE))
-            return f"{'.'.join(path)} is not a setting; {keys}{f'; did you mean {close}?' if close else ''}"
+            return f"{'.'.join(path)} is not a setting; {keys}"
         hint = typing.get_type_hints(config_class)[name]
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
         config_class = kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint

@@ -70,7 +70,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert details["scenes"] == ["lake", "town", "wood"]
     assert details["frames"] == 12
     assert "lpips" not in details["scene_means"]
-    assert details["paired"]["cf"]["mse"]["scenes"] == 3
+    assert details["paired"]["cf"]["scenes"] == 3
     assert set(details["paired"]) == set(ROWS) - {"ours"}
     assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
 

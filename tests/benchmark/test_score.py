@@ -1,7 +1,6 @@
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 from scipy.stats import wilcoxon
@@ -10,7 +9,6 @@ from polarnet.benchmark.score import (
     METRICS,
     BenchmarkConfig,
     FrameScore,
-    compared,
     paired_comparisons,
     scene_means,
     score_sequence,
@@ -151,34 +149,25 @@ def test_masked_pixels_count_in_no_score(make_sequence):
     assert all(a.ssim != b.ssim for a, b in zip(rows, unmasked, strict=True))
 
 
-def test_winning_all_of_six_scenes_has_effect_1_and_the_smallest_p_there_is():
-    comparison = compared(np.arange(1.0, 7.0))
-    assert comparison == {"scenes": 6, "better": 6, "effect": 1.0, "p": pytest.approx(2 / 2**6)}
+def scenes_of(method, values):
+    return [row(f"s{i}", value, method) for i, value in enumerate(values)]
 
 
-def test_ranks_by_hand():
-    # |gains| rank 1, 2, 3, 4; the second smallest is a loss: (1 - 2 + 3 + 4) / 10
-    comparison = compared(np.array([0.1, -0.2, 0.3, 0.4]))
-    assert comparison["effect"] == pytest.approx(0.6)
-    assert comparison["p"] == pytest.approx(wilcoxon([0.1, -0.2, 0.3, 0.4]).pvalue)
-
-
-def test_lower_is_better_for_errors_and_higher_for_psnr():
-    rows = [row(f"s{i}", 1.0 + i, "ours") for i in range(4)] + [row(f"s{i}", 2.0 + 1.5 * i, "cf") for i in range(4)]
-    comparison = paired_comparisons(rows, "ours")["cf"]
-    assert comparison["mse"]["better"] == 4
-    assert comparison["psnr"]["better"] == 0
-    assert comparison["mse"]["median_difference"] == pytest.approx(-1.75)
-    assert comparison["psnr"]["effect"] == -1
-    assert "lpips" not in comparison
+def test_pairs_are_counted_by_scene_and_winning_all_of_six_has_the_smallest_p_there_is():
+    rows = scenes_of("ours", range(1, 7)) + scenes_of("cf", [2.0 + 1.5 * i for i in range(6)])
+    assert paired_comparisons(rows, "ours") == {
+        "cf": {"scenes": 6, "better": 6, "median_difference": -2.25, "p": pytest.approx(2 / 2**6),
+               "p_holm": pytest.approx(2 / 2**6)}
+    }  # fmt: skip
     assert paired_comparisons(rows, "zeros") == {}
 
 
 def test_holm_corrects_for_the_number_of_rivals_and_never_falls():
     gains = {"a": [1, 2, 3, 4, 5, 6], "b": [1, 2, 3, 4, 5, -6], "c": [-1, 2, -3, 4, -5, 6]}
-    rows = [row(f"s{i}", 10.0, "ours") for i in range(6)]
-    rows += [row(f"s{i}", 10.0 + gain, name) for name, values in gains.items() for i, gain in enumerate(values)]
-    by_rival = {rival: scores["mse"] for rival, scores in paired_comparisons(rows, "ours").items()}
+    rows = scenes_of("ours", [10.0] * 6)
+    rows += [one for name, values in gains.items() for one in scenes_of(name, [10.0 + gain for gain in values])]
+    by_rival = paired_comparisons(rows, "ours")
+    assert by_rival["b"]["p"] == wilcoxon(gains["b"]).pvalue
     assert by_rival["a"]["p_holm"] == pytest.approx(3 * by_rival["a"]["p"])
     assert by_rival["b"]["p_holm"] == pytest.approx(2 * by_rival["b"]["p"])
     assert by_rival["a"]["p_holm"] <= by_rival["b"]["p_holm"] <= by_rival["c"]["p_holm"] <= 1

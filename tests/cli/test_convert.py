@@ -2,10 +2,9 @@
 
 import re
 
-import numpy as np
 import pytest
 import torch
-from event_fixtures import events_of, random_events
+from event_fixtures import events_of
 
 from polarnet.cli import main
 from polarnet.recordings.recording import read_recording
@@ -72,14 +71,3 @@ def test_the_parts_before_and_after_resets_of_the_clock_are_converted_as_advised
     for options, part in zip((first, second, third), parts, strict=True):
         assert main(["convert", str(source), str(out), *options]) == 0
         assert read_recording(out).events.t.tolist() == [t - part[0] for t in part]
-
-
-def test_events_go_round_through_three_formats_unchanged(tmp_path, capsys):
-    pytest.importorskip("h5py")
-    events = random_events(3, 2000, 10**6, 40, 50)
-    write_text(tmp_path / "a.txt", events, 10**6)
-    for source, target in (("a.txt", "b.raw"), ("b.raw", "c.h5"), ("c.h5", "d.txt")):
-        assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 0
-    back = read_recording(tmp_path / "d.txt").events
-    assert np.array_equal(back.t, events.t - events.t[0])
-    assert all(torch.equal(getattr(back, name), getattr(events, name)) for name in "xyp")

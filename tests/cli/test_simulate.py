@@ -226,19 +226,6 @@ def test_files_for_other_tools_read_back_equal_one_a_sensor(form, suffix, capsys
     assert f"{sum(map(len, stored('dofp'))):,}" in capsys.readouterr().out
 
 
-def test_recover_reads_the_store_and_its_files(capsys):
-    write_video("walk.mp4", np.concatenate([scenery(3, 32, 48), scenery(3, 32, 48)[::-1]]))
-    assert main(["simulate", "walk.mp4", "--out", "out", "--to", "store", "evt3", "--no-preview"]) == 0
-    raw = [f"out/polarizer_{angle:03d}.raw" for angle in POLARIZER_ANGLES_DEG]
-    wanted = ["--method", "highpass", "--write", "zarr", "--out"]
-    assert main(["recover", "out/events.zarr", *wanted, "a"]) == 0
-    assert main(["recover", *raw, "--angles", "0", "45", "90", "135", *wanted, "b"]) == 0
-    for name in "ab":
-        assert zarr.open_group(f"{name}/recovered.zarr", mode="r")["dolp"].shape[1:] == (32, 48)
-    counts = ", ".join(f"{len(e):,} at {angle}" for e, angle in zip(stored(), POLARIZER_ANGLES_DEG, strict=True))
-    assert capsys.readouterr().out.count(counts) == 3
-
-
 def test_interrupted_or_failed_runs_leave_an_earlier_run_and_nothing_else(tmp_path, monkeypatch, capsys):
     write_video("walk.mp4", scenery(3))
     command = ["simulate", "walk.mp4", "--out", "out", "--no-preview"]

@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from event_fixtures import random_events
 
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.run import Benchmark, panel_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, score_sequence
 from polarnet.benchmark.sequences import BenchmarkSet
-from polarnet.events.stream import Events
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, Skipped, write_manifest
 from polarnet.reports.artefacts import ReportPaths
@@ -51,17 +51,6 @@ def write_images(folder):
             )
         )  # fmt: skip
     write_manifest(Manifest(tuple(entries), (Skipped("broken.jpg", "cannot be read: ends early"),), 0, 0), folder)
-
-
-def random_events(seed, count, duration_us, height, width):
-    draw = np.random.default_rng(seed)
-    columns = [
-        np.sort(draw.integers(0, duration_us, count)),
-        draw.integers(0, width, count).astype(np.int16),
-        draw.integers(0, height, count).astype(np.int16),
-        (2 * draw.integers(0, 2, count) - 1).astype(np.int8),
-    ]
-    return Events(*map(torch.from_numpy, columns), height, width)
 
 
 def write_events(path, frames):

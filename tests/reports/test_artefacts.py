@@ -2,7 +2,7 @@ import subprocess
 
 import torch
 
-from polarnet.reports.artefacts import facts, read_results, training_history
+from polarnet.reports.artefacts import facts, read_results
 from polarnet.storage.frames import FrameStore
 
 
@@ -13,13 +13,6 @@ def test_a_panel_holds_the_truth_of_the_window_it_names(data, paths):
         assert torch.equal(frames.dolp[panel.window + 1], panel.truth.dolp)
         assert set(panel.predictions) == {"zeros", "oracle_mean", "e2v", "ours"}
         assert [row for row, one in panel.predictions.items() if one.aolp is not None] == ["e2v"]
-
-
-def test_the_best_epoch_is_the_one_with_the_lowest_validation_mse(paths):
-    history = training_history(paths.train / "ours")
-    assert history.best_epoch == 1
-    assert list(history.loss) == ["total", "mse"]
-    assert history.validation["psnr"] == [10.0, 11.0, 12.0]
 
 
 def test_edited_code_is_said_but_what_the_pipeline_writes_is_no_edit(tmp_path):

@@ -1,6 +1,6 @@
 import math
 
-from polarnet.reports.tables import COLUMNS, ERROR_PARTS, PAPER_TABLE_2, as_markdown, paper_table, score_table
+from polarnet.reports.tables import COLUMNS, PAPER_TABLE_2, paper_table, score_table
 
 SCORES = {
     "ours": {"mse": 0.02, "psnr": 17.0, "ssim": 0.4, "lpips": None, "corr": 0.6, "ms_per_window": 19.04},
@@ -41,13 +41,10 @@ def test_lpips_names_its_backbone_in_heading_and_caption():
     table = score_table(scores)
     assert "LPIPS (alex) ↓" in table.headings
     assert table.notes == ("LPIPS (alex): version 0.1 on the features of AlexNet.",)
-    assert score_table(scores, ERROR_PARTS).notes == ()
+    assert score_table(scores, {"mse": COLUMNS["mse"]}).notes == ()
 
 
-def test_intervals_stand_below_their_values_with_the_same_decimals_and_what_rounds_to_zero_has_no_sign():
-    table = score_table({"cf": {"psnr": 7.0}, "ours": {"psnr": 17.0, "psnr_ci": [16.125, 18.0]}})
-    assert "**17.00**<br><sub>16.12 to 18.00</sub>" in as_markdown(table)
-    assert row(table, "cf").cells[0].interval == ""
+def test_what_rounds_to_zero_has_no_sign():
     assert [COLUMNS["skill"].printed(value) for value in (-0.0001, -0.0006)] == ["0.000", "-0.001"]
 
 
