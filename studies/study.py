@@ -7,9 +7,11 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import torch
 
@@ -74,6 +76,15 @@ def in_own_process(module: str, *words: object) -> Any:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def passed(*tests: str) -> dict[str, bool]:
+    """Whether each case of these tests passed, by its name; a skipped one did not. Tests are named as pytest does."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        subprocess.run([sys.executable, "-m", "pytest", *tests, f"--junitxml={report}"], cwd=ROOT, check=False)
+        cases = ElementTree.parse(report).getroot().iter("testcase")
+        return {str(case.get("name")): len(case) == 0 for case in cases}
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:
