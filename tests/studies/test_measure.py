@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.reports.artefacts import git
 from studies import study
-from studies.measure import STUDIES, Study, command_of, finished, measure_ablation, measure_pipeline, timed_make
+from studies.measure import measure_ablation, measure_pipeline, measure_run, timed_make
 from studies.study import arguments_of, command_line, uncommitted, write_section
 
 IDENTITY = ("-c", "user.name=a", "-c", "user.email=a@b.c")
@@ -44,22 +44,19 @@ def test_a_section_of_the_results_is_replaced_and_headlines_join_what_is_there(t
     }
 
 
-def test_a_study_is_finished_if_its_figures_name_the_present_commit(tmp_path):
+def test_a_finished_run_becomes_rows_scenes_and_pairs(tmp_path):
+    folder = tmp_path / "benchmark" / "sets" / "simulated"
+    folder.mkdir(parents=True)
+    row = {"mse": 0.5, "mse_ci": [0.4, 0.6]}
+    for name, content in {
+        "metrics": {"cf": row, "ours": row}, "cost": {"cf": {"params": 0}, "ours": {"params": 9}},
+        "details": {"scenes": {"a": {}, "b": {}}, "frames": 50, "paired": {"cf": {"mse": {"better": 2}, "ssim": {}}}},
+    }.items():  # fmt: skip
+        (folder / f"{name}.json").write_text(json.dumps(content))
     commit_all(tmp_path)
-    assert not finished("speed", "models", tmp_path)
-    write_section("speed", "models", {}, {"commit": git(tmp_path, "rev-parse", "HEAD")}, root=tmp_path)
-    assert finished("speed", "models", tmp_path)
-    git(tmp_path, *IDENTITY, "commit", "--quiet", "--allow-empty", "-m", "two")
-    assert not finished("speed", "models", tmp_path)
-
-
-def test_a_study_gets_the_options_that_it_takes():
-    given = {"photographs": "a", "measured": ["b", "c"], "work": "d", "photographs_large": None, "published": []}
-    command = command_of(STUDIES["robustness"], given)
-    assert command[1:] == [
-        "-m", "studies.robustness", "--write", "--photographs", "a", "--measured", "b", "c", "--work", "d",
-    ]  # fmt: skip
-    assert command_of(Study("rig", "recordings", "rig"), given)[1:] == ["-m", "studies.rig", "--write"]
+    written = json.loads(measure_run("paper", tmp_path, tmp_path).read_text())["paper_small"]
+    assert (written["scenes"], written["frames"], written["paired"]) == (2, 50, {"cf": {"better": 2}})
+    assert [(one["mse"], one["params"]) for one in written["rows"].values()] == [(0.5, 0), (0.5, 9)]
 
 
 def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
