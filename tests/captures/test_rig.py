@@ -24,7 +24,7 @@ SMALL = {"enabled": True, "sensor": [96, 160], "region": [24, 2], "negative_even
          "size": [16, 24]}  # fmt: skip
 RIG = RigConfig(
     speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=PICTURE_RATE_HZ,
-    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3, file_type="bin",
+    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3,
 )  # fmt: skip
 
 
