@@ -1,12 +1,11 @@
 """Figures of the pipeline, and the pictures of docs: python -m studies.measure
 
-    [--pipeline] [--sweep FOLDER] [--run NAME DATA] [--pictures]
+    [--pipeline] [--run NAME DATA] [--pictures]
 
---pipeline times the demo in a fresh clone (docs/results/pipeline.json). --sweep reads a sweep over conf/ablation
-(network.json). --run reads the simulated test set of a run of the pipeline in the folder DATA: `paper` of
-experiment=paper_small, `benchmark` of experiment=photographs with the rows of the table. --pictures draws those that
-show nothing but the simulation, the shipped weights and the demo. The tree must be committed, because figures name a
-commit. Every other study is a command of its own.
+--pipeline times the demo in a fresh clone (docs/results/pipeline.json). --run reads the simulated test set of a run of
+the pipeline in the folder DATA: `paper` of experiment=paper_small, `benchmark` of experiment=photographs with the rows
+of the table. --pictures draws those that show nothing but the simulation, the shipped weights and the demo. The tree
+must be committed, because figures name a commit. Every other study is a command of its own.
 """
 
 import argparse
@@ -23,7 +22,6 @@ from typing import Any
 
 from PIL import Image
 
-from polarnet.config.sweep import sweep_points
 from studies.study import (
     PICTURES,
     ROOT,
@@ -38,7 +36,6 @@ DEMO_METRICS = "data/benchmark/metrics.json"
 STAGE_STARTS = re.compile(r"Running stage '([\w@+]+)'")  # printed by dvc repro
 RUNS = {"paper": "paper_small", "benchmark": "simulated"}
 """Section of docs/results/NAME.json that a finished run fills, by NAME."""
-ABLATION_SCORES = ("mse", "level_mse", "pattern_mse", "psnr", "ssim", "corr", "aolp_deg")
 PICTURE_MODULES = ("overview", "simulation_pictures", "physics_pictures")
 
 
@@ -89,27 +86,6 @@ def timed_make(target: str, folder: Path) -> tuple[float, dict[str, float]]:
     return round((ended - started) / 60, 2), stages
 
 
-def measure_ablation(sweep: Path, root: Path = ROOT) -> Path:
-    """Write section `ablation` of docs/results/network.json from a sweep over conf/ablation, without failed jobs.
-
-    RuntimeError if a job has no `ablation=NAME`, or if the reference `ablation=nothing` is missing.
-    """
-    rows: dict[str, dict[str, Any]] = {}
-    for point in sweep_points(sweep):
-        given = dict(one.lstrip("+").split("=", 1) for one in point["overrides"])
-        if "ablation" not in given:
-            raise RuntimeError(f"{sweep / point['job']}: expected ablation=NAME among its overrides, got {given}")
-        if not point["failure"]:
-            comment = (root / "conf" / "ablation" / f"{given['ablation']}.yaml").read_text().splitlines()[1]
-            scores = {key: point["test"].get(key) for key in ABLATION_SCORES}
-            rows[given["ablation"]] = {"about": comment.removeprefix("# "), **scores}
-    if "nothing" not in rows:
-        raise RuntimeError(f"{sweep}: expected a finished job with ablation=nothing, got {', '.join(rows) or 'no job'}")
-    order = sorted(rows, key=lambda name: (name != "nothing", -rows[name]["mse"]))
-    figures = {"rows": {name: rows[name] for name in order}}
-    return write_section("network", "ablation", figures, machine_record(root), root=root)
-
-
 def measure_run(name: str, data: Path, root: Path = ROOT) -> Path:
     """Write docs/results/NAME.json from the simulated test set of a finished run in the folder `data`."""
     folder = data / "benchmark" / "sets" / "simulated"
@@ -140,11 +116,8 @@ def main() -> None:
     parser.set_defaults(write=True)
     parser.add_argument("--pipeline", action="store_true")
     parser.add_argument("--pictures", action="store_true")
-    parser.add_argument("--sweep", type=Path, metavar="FOLDER")
     parser.add_argument("--run", nargs=2, metavar=("NAME", "DATA"))
     arguments = arguments_of(parser)
-    if arguments.sweep:
-        measure_ablation(arguments.sweep)
     if arguments.run:
         measure_run(arguments.run[0], Path(arguments.run[1]))
     if arguments.pipeline:

@@ -63,12 +63,6 @@ def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
     return arguments
 
 
-def run_stage(name: str, *overrides: str, environment: Mapping[str, str] | None = None) -> None:
-    """Run stage `name` of the pipeline with these overrides; CalledProcessError if it fails."""
-    command = [sys.executable, "-m", f"stages.{name}", *overrides]
-    subprocess.run(command, cwd=ROOT, env=environment or os.environ, check=True)
-
-
 def in_own_process(module: str, *words: object) -> Any:
     """What `python -m MODULE WORDS` prints as JSON in its last line; RuntimeError with its messages if it fails."""
     command = [sys.executable, "-m", module, *map(str, words)]

@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.reports.artefacts import git
 from studies import study
-from studies.measure import measure_ablation, measure_pipeline, measure_run, timed_make
+from studies.measure import measure_pipeline, measure_run, timed_make
 from studies.study import arguments_of, command_line, uncommitted, write_section
 
 IDENTITY = ("-c", "user.name=a", "-c", "user.email=a@b.c")
@@ -72,27 +72,6 @@ def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
     assert "code.py" in uncommitted(tmp_path)
     with pytest.raises(RuntimeError, match="uncommitted changes"):
         measure_pipeline(tmp_path)
-
-
-def swept(root, write_trial, **mse):
-    (root / "conf" / "ablation").mkdir(parents=True)
-    for number, (name, value) in enumerate(mse.items()):
-        write_trial(
-            root / "sweep" / str(number), [f"ablation={name}", "paths.data=x"], test={"mse": value, "psnr": 15.0}
-        )
-        (root / "conf" / "ablation" / f"{name}.yaml").write_text(f"# @package _global_\n# Without {name}.\n")
-    commit_all(root)
-    return root / "sweep"
-
-
-def test_an_ablation_shows_the_unchanged_network_first_and_then_the_worst(tmp_path, write_trial):
-    with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
-        measure_ablation(swept(tmp_path / "lacking", write_trial, sums=0.05), tmp_path / "lacking")
-    sweep = swept(tmp_path / "whole", write_trial, sums=0.05, scales=0.06, nothing=0.03)
-    rows = json.loads(measure_ablation(sweep, tmp_path / "whole").read_text())["ablation"]["rows"]
-    assert {name: (row["about"], row["mse"]) for name, row in rows.items()} == {
-        "nothing": ("Without nothing.", 0.03), "scales": ("Without scales.", 0.06), "sums": ("Without sums.", 0.05),
-    }  # fmt: skip
 
 
 def test_figures_of_a_changed_tree_may_be_measured_but_not_written(monkeypatch, capsys):
