@@ -6,6 +6,7 @@ and what the shipped network makes of it.
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -15,10 +16,11 @@ from polarnet.pictures.images import read_rgb
 from polarnet.recovery import recover
 from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image, intensity_image, polarization_hsv
+from polarnet.simulation.motion import Trajectory, sensor_to_scene
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.sequence import simulate
 from polarnet.stokes import POLARIZER_ANGLES_DEG
-from studies.simulation_pictures import OFF, ON, drawn, sensor_outline, write_pictures
+from studies.simulation_pictures import OFF, ON, drawn, write_pictures
 
 PHOTO = next(photo.path for photo in BUILTIN_PHOTOS if photo.path.stem.startswith("motorcycle"))
 WINDOW = 24  # of 30; the figure shows its events, and the frames at its end
@@ -57,6 +59,14 @@ def overview_figure(figure: Figure) -> None:
     for axes, events in zip(columns[3].subplots(4, 1), simulation.events, strict=True):
         _cloud(axes, slice_time(events, start_us, stop_us), start_us, stop_us)
     _pictures(columns[4], recovered=dolp_image(recovered), truth=dolp_image(dolp))
+
+
+def sensor_outline(trajectory: Trajectory, t_s: float, height: int, width: int) -> Float64[np.ndarray, "2 5"]:
+    """Columns and rows of the scene at the corners of the sensor, the first one twice, at a time in seconds."""
+    pose = [float(value[0]) for value in trajectory.pose(np.array([t_s]))]
+    left, top, along, across = sensor_to_scene(*pose, height, width)
+    columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])
+    return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
 
 
 def _pictures(figure: Figure, **pictures: np.ndarray) -> None:

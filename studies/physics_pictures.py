@@ -11,32 +11,26 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float64
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from polarnet.config.tree import load
-from polarnet.events.mosaic import places_of
 from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, show_picture
-from polarnet.reports.maps import dolp_image, intensity_image
-from polarnet.simulation.camera import PERFECT, Camera, PolarizersConfig, read_out, weights_of
+from polarnet.reports.maps import dolp_image
+from polarnet.simulation.camera import PERFECT, Camera, read_out
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import Pose, Sine, Trajectory, render_poses
-from polarnet.simulation.moving_sensor import channel_light, emulate_motion
+from polarnet.simulation.motion import Sine, Trajectory
+from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import respond
 from polarnet.simulation.pixels.physics import physics_of
-from polarnet.simulation.presets import POLARIZERS, SENSORS
-from polarnet.simulation.scene import PolarizationScene
+from polarnet.simulation.presets import SENSORS
 from polarnet.stokes import (
-    POLARIZER_ANGLES_DEG,
-    analyzer,
     dolp,
     intensities_from_stokes,
-    parse_mosaic,
     stokes_from_intensities,
 )
-from studies.simulation_pictures import OFF, ON, QUIET, drawn, events_under, photograph, write_pictures
+from studies.simulation_pictures import ON, QUIET, drawn, photograph, write_pictures
 from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
@@ -52,127 +46,6 @@ EVENT_STYLES: tuple[dict[str, Any], ...] = (
     {"color": COLOURS[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
     {"color": LIGHT.quiet, "linestyle": "-."},
 )  # fmt: skip
-LIGHTS_DN = (0, 15, 30, 60, 90, 120, 150, 180, 210, 240, 255)
-
-
-@drawn(9.0, 4.4)
-def pixel_figure(figure: Figure) -> None:
-    """Draw a pixel's physics, from its light to its events."""
-    draws = (_draw_photoreceptor, _draw_mismatch, _draw_noise, _draw_bit_depth)
-    for axes, draw in zip(figure.subplots(2, 2).ravel(), draws, strict=True):
-        draw(axes)
-
-
-def _draw_photoreceptor(axes: Axes) -> None:
-    """The sum of the events of a pixel with small thresholds follows the filtered response."""
-    config = replace(QUIET, cutoff_hz=60.0, contrast_threshold_on=0.01, contrast_threshold_off=0.01)
-    t_us = np.arange(0, 60_001, 100.0)
-    for light_dn, colour in zip((200.0, 60.0, 15.0), COLOURS, strict=False):
-        light = np.where(t_us < 5_000, light_dn / 1.25, light_dn)
-        ends = np.empty(2, np.float32)
-        respond(np.array([light_dn / 1.25, light_dn], np.float32), physics_of(QUIET), ends)
-        events = events_under(light, t_us, config)
-        t_ms, rise = events.t.numpy() / 1000, events.p.numpy().cumsum() * 0.01 / float(ends[1] - ends[0])
-        axes.step(np.r_[0, t_ms, 60], np.r_[0, rise, rise[-1:]], where="post", color=colour, linewidth=1.2)
-        axes.text(58, 1.12 - 0.12 * (200.0, 60.0, 15.0).index(light_dn) - 0.45, f"{light_dn:g} DN", color=colour,
-                  ha="right", fontsize=8)  # fmt: skip
-    axes.set(xlabel="ms", ylabel="share of a step", xlim=(0, 60), ylim=(0, 1.05))
-    axes.set_title("photoreceptor, 60 Hz: slow in the dark", loc="left", fontsize=9)
-
-
-def _draw_mismatch(axes: Axes) -> None:
-    """The first event on a ramp of log light comes when the ramp has reached the pixel's threshold."""
-    config = SENSORS["default"]
-    quiet = replace(config, cutoff_hz=0.0, leak_rate_hz=0.0, shot_noise_rate_hz=0.0, refractory_period_us=0.0)
-    t_us = np.arange(0, 1_000_001, 5_000.0)
-    for sign, colour, label in ((1, ON, "ON"), (-1, OFF, "OFF")):
-        events = events_under(80 * np.exp(sign * 0.35 * t_us / 1e6), t_us, quiet, pixels=20_000)
-        first = np.full(20_000, np.nan)
-        x, t = events.x.numpy()[::-1], events.t.numpy()[::-1]
-        first[x] = t
-        counts, edges = np.histogram(0.35 * first / 1e6, np.arange(0.08, 0.34, 0.008))
-        axes.stairs(counts, edges, color=colour, linewidth=1.3, label=label)
-    axes.legend(fontsize=8, frameon=False)
-    axes.set(xlabel="threshold of a pixel, ln units", ylabel="pixels of 20,000")
-    axes.set_title("mismatch of the default sensor", loc="left", fontsize=9)
-
-
-def _draw_noise(axes: Axes) -> None:
-    """Events in constant light, against its brightness."""
-    seconds, pixels = 20, 500
-    t_us = np.array([0.0, seconds * 1e6])
-    shot, leak = replace(QUIET, shot_noise_rate_hz=5.0), replace(QUIET, leak_rate_hz=1.0)
-    for label, config, sign, colour, marker in (
-        ("shot noise, ON", shot, 1, ON, "^"), ("shot noise, OFF", shot, -1, OFF, "v"),
-        ("leak, ON", leak, 1, COLOURS[3], "o"),
-    ):  # fmt: skip
-        fired = [events_under(np.full(2, float(light)), t_us, config, pixels).p == sign for light in LIGHTS_DN]
-        rates = [float(one.sum()) / pixels / seconds for one in fired]
-        axes.plot(LIGHTS_DN, rates, marker, color=colour, markersize=4, label=label)
-    light = np.linspace(0, 255, 50)
-    axes.plot(light, 2.5 * (1 - 0.75 * (light + 20) / 275), color=LIGHT.quiet, linewidth=1, label="v2e's formula")
-    axes.legend(fontsize=7, frameon=False)
-    axes.set(xlabel="light, DN", ylabel="events per second", ylim=(0, 3.3))
-    axes.set_title("shot noise 5 Hz, leak 1 Hz", loc="left", fontsize=9)
-
-
-def _draw_bit_depth(axes: Axes) -> None:
-    """A slow ramp from 10 to 40 DN, as floating-point light and rounded to 8 bits."""
-    t_us = np.arange(0, 2_000_001, 2_000.0)
-    light = 10 * np.exp(np.log(4) * t_us / 2e6)
-    config = replace(QUIET, contrast_threshold_on=0.05, contrast_threshold_off=0.05)
-    for row, (eight_bit, label) in enumerate(((False, "floating-point light"), (True, "rounded to 8 bits"))):
-        events = events_under(light, t_us, config, eight_bit=eight_bit)
-        axes.vlines(events.t.numpy() / 1e6, 1.5 * row + 0.1, 1.5 * row + 0.9, color=ON, linewidth=0.8)
-        moments = len(np.unique(events.t.numpy() // 2_000))
-        axes.text(0, 1.5 * row + 0.95, f"{label}: {len(events)} events at {moments} times", fontsize=8,
-                  color=LIGHT.quiet, va="bottom")  # fmt: skip
-    axes.set_yticks([])
-    axes.set(xlabel="s", ylim=(-0.1, 2.9), xlim=(-0.02, 2.02))
-    axes.grid(visible=False)
-    axes.set_title("ramp from 10 to 40 DN, threshold 0.05", loc="left", fontsize=9)
-
-
-@drawn(9.0, 2.7)
-def polarizers_figure(figure: Figure) -> None:
-    """Draw Malus' law for each preset, and a picture through the mosaic of a DoFP sensor."""
-    curves, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.05))[0]
-    for part in (curves, right):
-        part.set_facecolor(LIGHT.face)
-    axes = curves.subplots()
-    angles = np.radians(np.linspace(-90, 90, 361))
-    for (name, polarizers), colour in zip(POLARIZERS.items(), COLOURS, strict=True):
-        through = analyzer(angles, polarizers.extinction_ratio[0] or math.inf, polarizers.transmission[0])[:2].sum(0)
-        axes.semilogy(np.degrees(angles), through.clip(1e-6), color=colour, linewidth=1.4,
-                      label=name.replace("_", " "))  # fmt: skip
-    axes.set(xlabel="angle between light and axis, degrees", ylabel="transmission", ylim=(1e-4, 1.5), xlim=(-90, 90))
-    axes.set_xticks(range(-90, 91, 45))
-    axes.legend(fontsize=8, frameon=False, loc="lower center")
-    axes.set_title("fully polarized light", loc="left", fontsize=9)
-    _draw_mosaic(right, POLARIZERS["micropolarizers"])
-
-
-def _draw_mosaic(figure: Any, polarizers: PolarizersConfig) -> None:
-    """A part of a photograph as the pixels of a DoFP sensor see it, and its four channels."""
-    channels = channels_of(photograph(), polarizers)[:, 20:52, 30:62]
-    raw = np.empty((64, 64))
-    for channel, (row, column) in zip(channels, places_of(parse_mosaic(polarizers.mosaic)), strict=True):
-        raw[row::2, column::2] = channel
-    grid = figure.add_gridspec(2, 4)
-    whole = figure.add_subplot(grid[:, :2])
-    show_picture(whole, intensity_image(torch.from_numpy(raw / raw.max()).float()), LIGHT)
-    whole.set_title("DoFP sensor", loc="left", fontsize=9)
-    for number, (channel, angle) in enumerate(zip(channels, POLARIZER_ANGLES_DEG, strict=True)):
-        axes = figure.add_subplot(grid[number // 2, 2 + number % 2])
-        show_picture(axes, intensity_image(torch.from_numpy(channel / raw.max()).float()), LIGHT)
-        axes.set_title(f"{angle}°", loc="left", fontsize=9)
-
-
-def channels_of(scene: PolarizationScene, polarizers: PolarizersConfig) -> Float64[np.ndarray, "4 h2 w2"]:
-    """Light of the four channels, in [0, 1], of a still sensor in the middle of the scene."""
-    middle = Pose(*(np.array([value]) for value in ((scene.width - 1) / 2, (scene.height - 1) / 2, 0.0, 1.0)))
-    light = render_poses(scene, middle, *SIZE).transpose(1, 0, 2, 3)
-    return channel_light(light, polarizers, weights_of(polarizers, *SIZE, key=1))[:, 0].astype(np.float64) / 255
 
 
 @drawn(9.0, 2.8)
@@ -253,8 +126,6 @@ def light_figure(figure: Figure) -> None:
 
 FIGURES = {
     "theory_gains": gains_figure,
-    "physics_pixel": pixel_figure,
-    "physics_polarizers": polarizers_figure,
     "physics_readout": readout_figure,
     "physics_light": light_figure,
 }

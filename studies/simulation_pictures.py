@@ -21,11 +21,10 @@ from PIL import Image
 from polarnet.events.stream import Events, select, slice_time
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
-from polarnet.reports.figures import LIGHT, show_picture, styled
+from polarnet.reports.figures import LIGHT, styled
 from polarnet.reports.maps import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
-from polarnet.simulation.presets import MOTIONS, SENSORS
+from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 
 ON, OFF = "#d0312d", "#1f5fb8"
@@ -77,10 +76,9 @@ def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, 
 
 
 def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
-                 pixels: int = 1, key: int = 5, eight_bit: bool = False) -> Events:  # fmt: skip
+                 pixels: int = 1, key: int = 5) -> Events:  # fmt: skip
     """Events of neighbouring pixels under one light."""
     frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
-    frames = frames.round().to(torch.uint8) if eight_bit else frames
     (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=key)
     return events
 
@@ -140,42 +138,6 @@ def crossings_figure(figure: Figure) -> None:
     stamps.grid(visible=False)
 
 
-@drawn(9.0, 1.75)
-def motion_figure(figure: Figure) -> None:
-    """Draw the sensor's path over a picture for several values of the motion parameters."""
-    picture = read_rgb(PHOTO).permute(1, 2, 0).numpy()
-    default = MOTIONS["default"]
-    motions = {
-        "40 to 50 px/s": replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0),
-        "250 to 300 px/s": replace(default, speed_min_px_s=250.0, speed_max_px_s=300.0, acceleration_max_px_s2=4000.0),
-        "rotation up to 40°": replace(default, rotation_max_deg=40.0),
-        "zoom up to 2.5": replace(default, zoom_max=2.5),
-    }
-    for axes, (label, motion) in zip(figure.subplots(1, 4), motions.items(), strict=True):
-        show_picture(axes, picture[::2, ::2], LIGHT)
-        axes.images[0].set_extent((-0.5, picture.shape[1] - 0.5, picture.shape[0] - 0.5, -0.5))
-        trajectory = random_trajectory(motion, picture.shape[0], picture.shape[1], np.random.default_rng(4))
-        _way(axes, trajectory, motion)
-        axes.set_title(label, loc="left", fontsize=9)
-
-
-def _way(axes: Axes, trajectory: Trajectory, motion: SynthesizeConfig) -> None:
-    """Draw the path of the sensor's centre over a second, and its outline at five times, the last one strongest."""
-    pose = trajectory.pose(np.linspace(0, motion.duration_s, 200))
-    axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
-    for k, t_s in enumerate(np.linspace(0, motion.duration_s, 5)):
-        outline = sensor_outline(trajectory, t_s, motion.sensor_height, motion.sensor_width)
-        axes.plot(*outline, color="white", linewidth=1.0, alpha=0.3 + 0.7 * k / 4)
-
-
-def sensor_outline(trajectory: Trajectory, t_s: float, height: int, width: int) -> Float64[np.ndarray, "2 5"]:
-    """Columns and rows of the scene at the corners of the sensor, the first one twice, at a time in seconds."""
-    pose = [float(value[0]) for value in trajectory.pose(np.array([t_s]))]
-    left, top, along, across = sensor_to_scene(*pose, height, width)
-    columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])
-    return np.stack([left + columns * along - rows * across, top + columns * across + rows * along])
-
-
 def _light(axes: Axes, t_ms: Float64[np.ndarray, " n"], title: str) -> None:
     """Draw log light on the upper half of a panel; rows of events come below."""
     log = np.log(light_of_one_pixel(t_ms))
@@ -208,7 +170,6 @@ def few_colours(content: bytes, colours: int = COLOURS) -> bytes:
 FIGURES = {
     "simulation_parameters": parameters_figure,
     "simulation_crossings": crossings_figure,
-    "simulation_motion": motion_figure,
 }
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from polarnet.simulation.motion import random_trajectory
 from polarnet.simulation.presets import MOTIONS
-from studies.simulation_pictures import sensor_outline
+from studies.overview import sensor_outline
 
 
 def test_the_outline_has_the_size_of_the_sensor_and_lies_on_the_picture():
