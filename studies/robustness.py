@@ -188,26 +188,20 @@ def table_of(scores: Scores) -> dict[str, Any]:
 
 def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
     """Figures of one row that stand above the sections of docs/results/robustness.json."""
-    figures: dict[str, Any] = {}
-    for name in ("photographs", "photographs_large"):
-        if name in tables:
-            figures[name] = {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
+    figures: dict[str, Any] = {
+        name: {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
+        for name in ("photographs", "photographs_large")
+        if name in tables
+    }
     if "measured" in tables:
         rows = tables["measured"]["rows"]
         best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
-        keys = ("mse_over_oracle_mean", "median_over_oracle_mean")
-        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best} | {
-            key: rows[row][key] for key in keys
-        }
+        ratios = {key: rows[row][key] for key in ("mse_over_oracle_mean", "median_over_oracle_mean")}
+        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best, **ratios}
         figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
-    if "sensors.default" in tables:
-        default = tables["sensors.default"]["rows"][row]["mse"]
-        relative = {
-            name.removeprefix("sensors."): table["rows"][row]["mse"] / default
-            for name, table in tables.items()
-            if name.startswith("sensors.")
-        }
-        figures["sensors"] = {"worst_over_default": max(relative.values())}
+    errors = {name: table["rows"][row]["mse"] for name, table in tables.items() if name.startswith("sensors.")}
+    if "sensors.default" in errors:
+        figures["sensors"] = {"worst_over_default": max(errors.values()) / errors["sensors.default"]}
     return figures
 
 
