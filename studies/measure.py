@@ -9,9 +9,7 @@ must be committed, because figures name a commit. Every other study is a command
 """
 
 import argparse
-import itertools
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -33,7 +31,6 @@ from studies.study import (
 )
 
 DEMO_METRICS = "data/benchmark/metrics.json"
-STAGE_STARTS = re.compile(r"Running stage '([\w@+]+)'")  # printed by dvc repro
 RUNS = {"paper": "paper_small", "benchmark": "simulated"}
 """Section of docs/results/NAME.json that a finished run fills, by NAME."""
 PICTURE_MODULES = ("overview", "simulation_pictures", "physics_pictures")
@@ -42,8 +39,8 @@ PICTURE_MODULES = ("overview", "simulation_pictures", "physics_pictures")
 def measure_pipeline(root: Path = ROOT) -> Path:
     """Clone HEAD of the project at `root`, time its set-up, `make repro` and `make test`; write pipeline.json.
 
-    `dvc.lock` and the demo's metrics come from the same run. RuntimeError if a command fails, a
-    second `make repro` runs a stage, or the tree has uncommitted changes.
+    `dvc.lock` and the demo's metrics come from the same run. CalledProcessError if a command fails, RuntimeError if the
+    tree has uncommitted changes.
     """
     if uncommitted(root):
         raise RuntimeError("the tree has uncommitted changes; commit them first, the figures name a commit")
@@ -51,39 +48,20 @@ def measure_pipeline(root: Path = ROOT) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         clone = Path(folder) / "polarnet"
         subprocess.run(["git", "clone", "--quiet", str(root), str(clone)], check=True)
-        figures: dict[str, Any] = {"setup_minutes": timed_make("setup", clone)[0]}
-        figures["repro_minutes"], figures["stage_minutes"] = timed_make("repro", clone)
-        _, again = timed_make("repro", clone)
-        if again:
-            raise RuntimeError(f"a second make repro ran {', '.join(again)}; everything should have been cached")
+        figures: dict[str, Any] = {f"{target}_minutes": minutes_of(target, clone) for target in ("setup", "repro")}
         figures["metrics"] = scores_and_costs(clone / "data" / "benchmark" / "sets" / "simulated")
         (root / DEMO_METRICS).parent.mkdir(parents=True, exist_ok=True)
         for name in ("dvc.lock", DEMO_METRICS):
             shutil.copy(clone / name, root / name)
-        figures["test_minutes"], _ = timed_make("test", clone)
+        figures["test_minutes"] = minutes_of("test", clone)
     return write_section("pipeline", "demo", figures, machine, root=root)
 
 
-def timed_make(target: str, folder: Path) -> tuple[float, dict[str, float]]:
-    """Run `make target`; return its minutes and those of each DVC stage that it ran."""
+def minutes_of(target: str, folder: Path) -> float:
+    """Run `make target`, and return its minutes; CalledProcessError if it fails."""
     started = time.monotonic()
-    marks: list[tuple[str, float]] = []
-    with subprocess.Popen(
-        ["make", target], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            print(line, end="", flush=True)
-            if match := STAGE_STARTS.search(line):
-                marks.append((match[1], time.monotonic()))
-    ended = time.monotonic()
-    if process.returncode:
-        raise RuntimeError(f"make {target} failed in a fresh clone; what it printed is above")
-    stages: dict[str, float] = {}
-    for (name, start), (_, end) in itertools.pairwise([*marks, ("", ended)]):
-        stage = name.partition("@")[0]  # all rows and all trained baselines together
-        stages[stage] = round(stages.get(stage, 0) + (end - start) / 60, 2)
-    return round((ended - started) / 60, 2), stages
+    subprocess.run(["make", target], cwd=folder, check=True)
+    return round((time.monotonic() - started) / 60, 2)
 
 
 def measure_run(name: str, data: Path, root: Path = ROOT) -> Path:

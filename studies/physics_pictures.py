@@ -18,13 +18,8 @@ from polarnet.config.tree import load
 from polarnet.methods.intensities import consistent
 from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image
-from polarnet.simulation.camera import PERFECT, Camera, read_out
-from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import Sine, Trajectory
-from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.pixels.light import respond
 from polarnet.simulation.pixels.physics import physics_of
-from polarnet.simulation.presets import SENSORS
 from polarnet.stokes import (
     dolp,
     intensities_from_stokes,
@@ -37,8 +32,6 @@ COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
 WRONG_FACTORS = (1.0, 0.7, 1.4, 1.1)  # of the intensities behind 0, 45, 90 and 135 degrees
 NOISE = 0.02  # relative standard deviation of the intensities
 DARKEST = 0.004  # of white; added behind every polarizer, as stray light
-STILL = Sine(0.0, 0.0, 0.0)
-SWING = Trajectory(300.0, 200.0, (Sine(60.0, 8.0, 0.0),), (Sine(30.0, 5.0, 1.0),), STILL, STILL, 630.0)
 PALETTE = 256  # colours of a picture on disk
 SIZE = (200, 300)  # rows and columns of the sensor behind the presets
 EVENT_STYLES: tuple[dict[str, Any], ...] = (
@@ -46,36 +39,6 @@ EVENT_STYLES: tuple[dict[str, Any], ...] = (
     {"color": COLOURS[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
     {"color": LIGHT.quiet, "linestyle": "-."},
 )  # fmt: skip
-
-
-@drawn(9.0, 2.8)
-def readout_figure(figure: Figure) -> None:
-    """Draw the times of a flash by row, and a bus whose limit the events exceed."""
-    rows, rate = figure.subplots(1, 2)
-    t_us = torch.tensor([0.0, 5_000.0, 5_001.0, 30_000.0], dtype=torch.float64)
-    card = torch.tensor([50.0, 50.0, 75.0, 75.0])[:, None, None, None].expand(-1, 1, 60, 80).contiguous()
-    (flash,), _ = emulate(card, t_us, QUIET, key=1)  # a grey card becomes brighter at 5 ms
-    for readout, colour, label in (
-        (PERFECT, LIGHT.quiet, "perfect"),
-        (replace(PERFECT, row_latency_us=20.0), COLOURS[1], "20 µs a row"),
-        (replace(PERFECT, max_events_per_s=1e6, max_wait_us=1500.0), ON, "1 Mev/s, wait 1.5 ms"),
-    ):
-        events, _ = read_out(flash, readout, key=1, duration_us=30_000)
-        rows.plot(events.t.numpy() / 1000, events.y.numpy(), ".", color=colour, markersize=1.2, label=label)
-    rows.set(xlabel="ms", ylabel="row", xlim=(4.8, 8.0), ylim=(60, 0))
-    rows.legend(fontsize=7, frameon=False, markerscale=6, loc="lower right")
-    rows.set_title("a flash on 60 rows", loc="left", fontsize=9)
-    swing = emulate_motion(Camera(SENSORS["default"], key=1), photograph(), SWING, 1_000_000, (60, 80))[0]
-    limit_hz = 1e5
-    limited, lost = read_out(
-        swing, replace(PERFECT, max_events_per_s=limit_hz, max_wait_us=5_000.0), key=1, duration_us=1_000_000
-    )
-    for events, colour, label in ((swing, LIGHT.quiet, "of the pixels"), (limited, ON, "read out")):
-        counts = np.bincount(events.t.numpy() // 5_000, minlength=200)[:200]
-        rate.step(np.arange(200) * 5e-3, counts * 200 / 1000, where="post", color=colour, linewidth=1.2, label=label)
-    rate.set(xlabel="s", ylabel="kev/s", xlim=(0, 1), ylim=(0, None))
-    rate.legend(fontsize=7, frameon=False)
-    rate.set_title(f"limit {limit_hz / 1000:g} kev/s: {lost / len(swing):.0%} lost", loc="left", fontsize=9)
 
 
 @drawn(7.2, 2.0)
@@ -126,7 +89,6 @@ def light_figure(figure: Figure) -> None:
 
 FIGURES = {
     "theory_gains": gains_figure,
-    "physics_readout": readout_figure,
     "physics_light": light_figure,
 }
 

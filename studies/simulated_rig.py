@@ -4,7 +4,6 @@ The scene drifts from right to left. A bright stripe runs above it, and a dark l
 right. Each capture starts at a random time before the landmark.
 """
 
-import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,8 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt16
-from torch import Tensor
+from jaxtyping import Float64, Int64, UInt16
 
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
@@ -140,18 +138,6 @@ def rig_scene(
     return PolarizationScene(torch.from_numpy(scene)), path
 
 
-def true_dolp(truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig) -> Float32[Tensor, "n h w"]:
-    """DoLP of the noiseless intensities of the reduced crop; times count from the landmark."""
-    (height, width), (top, left) = recordings.crop, recordings.crop_corner
-    # offset from the centre of the sensor to the centre of the crop
-    right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
-    path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
-    frames = render(truth.scene, path, (t_us + truth.landmark_us) * 1e-6, height, width)
-    intensities = stokes.intensities_from_stokes(frames).clamp(0, 1)
-    small = torch.nn.functional.adaptive_avg_pool2d(intensities, (recordings.size[0], recordings.size[1]))
-    return stokes.dolp(stokes.stokes_from_intensities(small)).clamp(0, 1)
-
-
 def _landmark_us(scene: PolarizationScene, path: Drift, recordings: RecordingsConfig) -> int:
     """Time on the clock of the motion at which the noiseless mean of the region falls below the dark level."""
     height, width = recordings.region
@@ -191,9 +177,3 @@ def _hot_events(
     y, x = generator.permutation(np.repeat(np.array(sorted(hot)).reshape(-1, 2), counts, axis=0)).T
     t = np.sort(generator.integers(0, total_us, len(x)))
     return Events.from_columns(t, x, y, generator.choice([-1, 1], len(x)), height, width)
-
-
-def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:
-    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
-    differences = np.array([starts[c] - others[c] for c in (*EVENT_CAPTURES, *INTENSITY_CAPTURES)], float)
-    return (differences - differences.mean()).tolist()

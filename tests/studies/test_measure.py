@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.reports.artefacts import git
 from studies import study
-from studies.measure import measure_pipeline, measure_run, timed_make
+from studies.measure import measure_pipeline, measure_run
 from studies.study import arguments_of, command_line, uncommitted, write_section
 
 IDENTITY = ("-c", "user.name=a", "-c", "user.email=a@b.c")
@@ -14,21 +14,6 @@ def commit_all(root):
     git(root, "init", "--quiet")
     git(root, "add", ".")
     git(root, *IDENTITY, "commit", "--quiet", "--allow-empty", "-m", "one")
-
-
-def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
-    (tmp_path / "Makefile").write_text(
-        "two:\n\t@echo \"Running stage 'ingest':\"\n\t@sleep 0.7\n\t@echo \"Running stage 'train':\"\n\t@sleep 0.7\n"
-        "none:\n\t@echo nothing to do\n"
-        "broken:\n\t@exit 3\n"
-    )
-    minutes, stages = timed_make("two", tmp_path)
-    assert list(stages) == ["ingest", "train"]
-    assert all(value == 0.01 for value in stages.values())  # 0.7 s, to a hundredth of a minute
-    assert minutes == pytest.approx(sum(stages.values()), abs=0.011)
-    assert timed_make("none", tmp_path)[1] == {}
-    with pytest.raises(RuntimeError, match="make broken failed in a fresh clone"):
-        timed_make("broken", tmp_path)
 
 
 def test_a_section_of_the_results_is_replaced_and_headlines_join_what_is_there(tmp_path):
