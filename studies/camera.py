@@ -27,24 +27,19 @@ SIZE = (12, 16)  # rows and columns of the calibrated sensor
 STEP = 0.01  # contrast thresholds of its pixels, natural-log intensity
 LAMP_DOLP = 0.6  # keeps the light behind every pixel above the knee of the response
 HALF_TURN_US, FRAMES = 1_000_000, 360
-DEFECTS = {
-    "numbers of frames taken for angles": "pictures/test_polarimetry.py::test_numbers_that_count_frames_are_no_angles",
-    "white of left-aligned bits":
-        "pictures/test_polarimetry.py::test_bits_that_are_0_below_those_of_the_camera_do_not_raise_its_white",
-    "masks of DoFP cells":
-        "simulation/test_truth.py::test_a_cell_is_valid_unless_its_truth_or_light_changes_with_masked_pixels",
-    "motion of polarization alone": "simulation/test_video.py::test_texture_of_polarization_alone_moves_too",
-    "AoLP under roll":
-        "simulation/test_motion.py::test_a_bar_at_30_degrees_polarized_along_itself_stays_so_while_the_camera_rolls",
-    "adaptive rate behind a rotating polarizer":
-        "simulation/test_rotating_light.py"
-        "::test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need",
-    "8 bits behind a rotating polarizer": "simulation/test_rotating_light.py::test_v2e_sees_eight_bits_of_the_light",
-    "DoLP of NaN": "test_stokes.py::test_dolp_of_nan_is_nan",
-    "key of 2^64 - 1": "simulation/test_sensor_polarizers.py::test_keys_count_modulo_2_to_the_64",
-    "clipped transmission":
-        "simulation/test_sensor_polarizers.py::test_a_spread_at_full_transmission_lowers_its_mean_as_stated",
-}  # fmt: skip
+DEFECTS = (
+    "pictures/test_polarimetry.py::test_numbers_that_count_frames_are_no_angles",
+    "pictures/test_polarimetry.py::test_bits_that_are_0_below_those_of_the_camera_do_not_raise_its_white",
+    "simulation/test_truth.py::test_a_cell_is_valid_unless_its_truth_or_light_changes_with_masked_pixels",
+    "simulation/test_video.py::test_texture_of_polarization_alone_moves_too",
+    "simulation/test_motion.py::test_a_bar_at_30_degrees_polarized_along_itself_stays_so_while_the_camera_rolls",
+    "simulation/test_rotating_light.py"
+    "::test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need",
+    "simulation/test_rotating_light.py::test_v2e_sees_eight_bits_of_the_light",
+    "test_stokes.py::test_dolp_of_nan_is_nan",
+    "simulation/test_sensor_polarizers.py::test_keys_count_modulo_2_to_the_64",
+    "simulation/test_sensor_polarizers.py::test_a_spread_at_full_transmission_lowers_its_mean_as_stated",
+)
 """The test of each defect, below tests/."""
 FROM_V2E = ("default", "clean", "noisy", "random")
 """Sensors of conf/sensor that are no real camera's."""
@@ -95,10 +90,10 @@ def analyzer_error_max(seed: int = 1) -> float:
 def main() -> None:
     """Measure, print, and with --write keep the figures."""
     write = arguments_of(command_line(__doc__, "docs/results/camera.json")).write
-    record, cases = machine_record(), passed(*(f"tests/{test}" for test in DEFECTS.values()))
+    record, cases = machine_record(), passed(*(f"tests/{test}" for test in DEFECTS))
     mended = {
-        defect: min(right for case, right in cases.items() if case.partition("[")[0] == test.partition("::")[2])
-        for defect, test in DEFECTS.items()
+        test: min(right for case, right in cases.items() if case.partition("[")[0] == test.partition("::")[2])
+        for test in DEFECTS
     }
     cameras = [path for path in (ROOT / "conf" / "sensor").glob("*.yaml") if path.stem not in FROM_V2E]
     totals = {

@@ -4,7 +4,7 @@
   next stage would, an artefact must be refused with one line that names the file or the folder, or give the same values
   as before. --runs names projects with a finished run (`polarnet preset smoke`, then `dvc repro`); the first is
   damaged, the others, such as one with seed=2, serve for exchanges.
-- kills: writers are killed at a random rename. The old or the new result must be whole, and a rerun must work.
+- kills: writers of stores are killed at a random rename. The old or the new one must be whole, a rerun must work.
 - names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
 - pairs: two commands at once write to one place of the first of --runs (`studies.pairs`).
 
@@ -32,7 +32,6 @@ import torch
 
 from polarnet import cli
 from polarnet.benchmark.results import read_record, read_rows
-from polarnet.cli.outputs import run_folder
 from polarnet.config.origins import Run
 from polarnet.config.tree import load
 from polarnet.events.stream import Events
@@ -51,6 +50,7 @@ from studies.pairs import pairs
 from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
+MAX_RENAMES = 51  # of `write_store` on an old store
 TEXTS = (".json", ".csv", "SHA256SUMS")
 SECTIONS = ("artefacts", "kills", "names", "pairs")
 FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
@@ -105,9 +105,14 @@ PLACES = {
 """Folders of each kind of artefact, below `paths.data`."""
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Every file of an artefact."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 def files_in(folder: Path) -> list[Path]:
     """Files of an artefact that have content."""
-    return sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
+    return [path for path, content in contents(folder).items() if content]
 
 
 def one_of(things: Sequence[Any], generator: Generator) -> Any:
@@ -145,11 +150,6 @@ def one_file(change: Callable[[bytes, Generator], bytes], endings: tuple[str, ..
     return fault
 
 
-def deletion(folder: Path, others: Sequence[Path], generator: Generator) -> None:
-    """One file less."""
-    one_of(files_in(folder), generator).unlink()
-
-
 def exchange_of_files(folder: Path, others: Sequence[Path], generator: Generator) -> None:
     """One file replaced by another of its kind, in this artefact or in another of its kind."""
     file = one_of(files_in(folder), generator)
@@ -183,7 +183,7 @@ FAULTS: dict[str, Fault] = {
     "flipped bit": one_file(flip),
     "truncation": one_file(truncation),
     "other digit": one_file(digit, TEXTS),
-    "deletion": deletion,
+    "deletion": lambda folder, others, generator: one_of(files_in(folder), generator).unlink(),
     "exchange of files": exchange_of_files,
     "exchange of artefacts": exchange_of_artefacts,
     "no seal": without_seal,
@@ -193,7 +193,7 @@ FAULTS: dict[str, Fault] = {
 
 def outcome(use: Callable[[], str], folder: Path, undamaged: str) -> tuple[str, str]:
     """One of OUTCOMES for a damaged artefact, and the message."""
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = contents(folder)
     try:
         result = ("harmless", "") if use() == undamaged else ("silent", "other values")
     except REFUSALS as error:
@@ -201,9 +201,7 @@ def outcome(use: Callable[[], str], folder: Path, undamaged: str) -> tuple[str, 
         result = ("refused" if named and "\n" not in str(error) else "unnamed"), str(error)
     except Exception as error:
         result = "traceback", repr(error)
-    changed = {path for path in folder.rglob("*") if path.is_file()} != {*before}
-    lost = changed or any(path.read_bytes() != content for path, content in before.items())
-    return ("lost", "the reader changed files") if lost else result
+    return result if contents(folder) == before else ("lost", "the reader changed files")
 
 
 def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict[str, int]], list[str]]:
@@ -245,18 +243,6 @@ def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict
     return dict(sorted(counts.items())), lines
 
 
-def write_folder(place: Path, value: str) -> None:
-    """A run of a command that writes 30 files of a value."""
-    with run_folder(place, "recover") as partial:
-        for number in range(30):
-            (partial / f"{number}.txt").write_text(value)
-
-
-def read_folder(place: Path) -> set[str]:
-    """The values in the folder of a command."""
-    return {file.read_text() for file in place.glob("*.txt")}
-
-
 def write_store(place: Path, value: str, names: Sequence[str] = ("a", "b", "c")) -> None:
     """A store with a value as its attribute and in its events, a part for each name."""
     store = EventStore.create(place, names, 8, 9, {"value": value})
@@ -272,15 +258,8 @@ def read_events(place: Path) -> set[str]:
     return {str(int(t)) for name in store.sequences for t in store.read(name)[0].t} | {store.attributes["value"]}
 
 
-WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]]] = {
-    "folder of a command": (write_folder, read_folder),
-    "store": (write_store, read_events),
-}
-"""Writers that are killed while they replace an old result with a new one, and readers of the values there."""
-
-
-def killed_write(write: Callable[[Path, str], None], place: Path, value: str, after: int) -> None:
-    """In a process of its own: write, and die by SIGKILL before call `after` of a rename."""
+def killed_write(place: Path, value: str, after: int) -> None:
+    """In a process of its own: write a store, and die by SIGKILL before call `after` of a rename."""
     calls = itertools.count()
 
     def dying(call: Callable[..., Any]) -> Callable[..., Any]:
@@ -292,27 +271,25 @@ def killed_write(write: Callable[[Path, str], None], place: Path, value: str, af
         return call_or_die
 
     os.rename, os.replace, files._exchanged = dying(os.rename), dying(os.replace), dying(files._exchanged)
-    write(place, value)
+    write_store(place, value)
 
 
 def kills(cases: int) -> dict[str, dict[str, int]]:
-    """Outcomes of writers killed at any rename: the old or the new result is whole, or lost; no rerun works: stuck."""
-    counts = {f"kill of a {name}": dict.fromkeys(("whole", "lost", "stuck"), 0) for name in WRITERS}
-    for name, (write, read) in WRITERS.items():
-        with tempfile.TemporaryDirectory() as scratch:
-            place = Path(scratch, "place")
-            write(place, "1")
-            for number in range(cases):
-                old, new, rerun = (str(2 * number + k) for k in (1, 2, 3))
-                after = int(80 ** generator_for(number, name, "kill").random()) - 1  # folders have few renames
-                fork = multiprocessing.get_context("fork")
-                process = fork.Process(target=killed_write, args=(write, place, new, after))
-                process.start()
-                process.join()
-                what = "whole" if read(place) in ({old}, {new}) else "lost"
-                write(place, rerun)
-                counts[f"kill of a {name}"][what if read(place) == {rerun} else "stuck"] += 1
-    return counts
+    """Outcomes of kills at any rename: the old or the new store is whole, or lost; no rerun works: stuck."""
+    counts, fork = dict.fromkeys(("whole", "lost", "stuck"), 0), multiprocessing.get_context("fork")
+    with tempfile.TemporaryDirectory() as scratch:
+        place = Path(scratch, "place")
+        write_store(place, "1")
+        for number in range(cases):
+            old, new, rerun = (str(2 * number + k) for k in (1, 2, 3))
+            after = int(generator_for(number, "store", "kill").uniform(0, MAX_RENAMES))
+            process = fork.Process(target=killed_write, args=(place, new, after))
+            process.start()
+            process.join()
+            what = "whole" if read_events(place) in ({old}, {new}) else "lost"
+            write_store(place, rerun)
+            counts[what if read_events(place) == {rerun} else "stuck"] += 1
+    return {"kill of a store": counts}
 
 
 NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
@@ -365,7 +342,7 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
-    parser.add_argument("--kills", type=int, default=100, help="of each kind")
+    parser.add_argument("--kills", type=int, default=100, help="of stores")
     parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
     arguments = arguments_of(parser)
     studies: dict[str, Callable[[], Mapping[str, Any]]] = {

@@ -110,11 +110,6 @@ def write_section(
     return path
 
 
-def row_of(row: str, file: Path) -> str:
-    """Override that gives a row of the tables a file of weights."""
-    return f"++rows.{row}={{needs: '{file.resolve()}', settings: methods.sharpening}}"
-
-
 SCORES = (
     "mse", "psnr", "ssim", "lpips", "lpips_backbone", "level_mse", "pattern_mse", "corr", "grad", "skill", "aolp_deg",
     "ms_per_window", "gflop", "params",
