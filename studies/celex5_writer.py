@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Int, Int64, UInt8, UInt16
 
 from polarnet.events.stream import Events, validate
@@ -26,10 +25,12 @@ from polarnet.recordings.formats.celex5 import (
     microseconds,
 )
 from polarnet.recordings.formats.lines import lines_of
+from polarnet.simulation.compilation import compiled
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
 CSV_LINES = 2**18  # written at a time
+STEP = 2**15  # time stamps from one row to the next, at most
 
 
 def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_MHZ) -> Events:
@@ -45,24 +46,19 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
     stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
-    row, column = events.y.numpy().astype(np.int64), events.x.numpy().astype(np.int64)
-    p = events.p.numpy()
-    first_is_darker = np.zeros(len(p), np.bool_)
-    first_is_darker[np.unique(row * WIDTH + column, return_index=True)[1]] = True
-    first_is_darker &= p < 0
-    stamp = np.concatenate([np.zeros(first_is_darker.sum(), np.int64), stamp])
-    row, column = (np.concatenate([values[first_is_darker], values]) for values in (row, column))
-    p = np.concatenate([np.ones(first_is_darker.sum(), np.int8), p])
-    items = _items(stamp, row, column, _intensities(row * WIDTH + column, p))
+    pixel, p = events.y.numpy().astype(np.int64) * WIDTH + events.x.numpy(), events.p.numpy()
+    _, first = np.unique(pixel, return_index=True)
+    darker = np.sort(first[p[first] < 0])
+    stamp = np.concatenate([np.zeros(len(darker), np.int64), stamp])
+    pixel = np.concatenate([pixel[darker], pixel])
+    p = np.concatenate([np.ones(len(darker), np.int8), p])
+    items = np.empty(2 * len(p) + 1 + (int(stamp[-1]) // STEP if len(p) else 0), np.int64)
+    count, brightest = _fill_items(stamp, pixel, p, np.zeros(HEIGHT * WIDTH, np.int64), items)
+    if brightest > WHITE:
+        raise ValueError(f"expected up to {WHITE} events of one polarity in a row, a pixel has {brightest}")
+    items = items[:count]
     _write_packages(path, _packed(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)))
-    return Events(
-        torch.from_numpy(microseconds(stamp, clock_mhz)),
-        torch.from_numpy(column.astype(np.int16)),
-        torch.from_numpy(row.astype(np.int16)),
-        torch.from_numpy(p.copy()),
-        HEIGHT,
-        WIDTH,
-    )
+    return Events.from_columns(microseconds(stamp, clock_mhz), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
 
 
 def write_celex5_pictures(
@@ -123,42 +119,30 @@ def _packed_picture(picture: np.ndarray) -> np.ndarray:
     return np.stack([dark[:, 0] >> 4, dark[:, 1] >> 4, low], axis=1).astype(np.uint8)
 
 
-def _intensities(pixel: Int64[np.ndarray, " n"], p: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """An intensity from 1 to 4095 for each event, above or below that of the pixel's previous event."""
-    order = np.argsort(pixel, kind="stable")
-    level = np.cumsum(p[order], dtype=np.int64)
-    starts = np.flatnonzero(np.diff(pixel[order], prepend=-1))
-    length = np.diff(np.append(starts, len(p)))
-    lowest = np.minimum.reduceat(level, starts) if len(starts) else level
-    level += np.repeat(1 - lowest, length)
-    if len(level) and level.max() > WHITE:
-        raise ValueError(f"expected up to {WHITE} events of one polarity in a row, a pixel has {level.max()}")
-    intensity = np.empty_like(level)
-    intensity[order] = level
-    return intensity
+@compiled
+def _fill_items(stamp, pixel, p, intensity, items):
+    """Fill `items` with rows and columns; returns their number and the largest intensity. `intensity` starts with 0.
 
-
-def _stamps(stamp: np.ndarray, announced: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time stamps to send, from 0 and close enough to stay unambiguous; and the index of the event behind each."""
-    step = 2**15
-    sent = stamp[announced]
-    before = np.concatenate([[0], sent[:-1]])[: len(sent)]
-    between = np.maximum(sent - before - 1, 0) // step
-    rank = np.arange(between.sum()) - np.repeat(np.cumsum(between) - between, between)
-    times = np.concatenate([[0], np.repeat(before, between) + step * (1 + rank), sent])
-    places = np.concatenate([[0], np.repeat(announced, between), announced])
-    order = np.lexsort((times, places))
-    return times[order], places[order]
-
-
-def _items(
-    stamp: np.ndarray, row: np.ndarray, column: np.ndarray, intensity: np.ndarray
-) -> Int64[np.ndarray, " items"]:
-    announced = np.flatnonzero((np.diff(stamp, prepend=-1) != 0) | (np.diff(row, prepend=-1) != 0))
-    times, places = _stamps(stamp, announced)
-    rows = np.append(row, 0)[places]
-    items = (WHITE - intensity) << 16 | column << 5 | COLUMN
-    return np.insert(items, places, rows << 18 | (times & 0xFFFF) << 2 | ROW)
+    A row and its time come before their events, and at least every `STEP` stamps, so that 16 bits of a time suffice.
+    """
+    lowest = np.zeros_like(intensity)
+    for k in range(len(p)):
+        intensity[pixel[k]] += p[k]
+        lowest[pixel[k]] = min(lowest[pixel[k]], intensity[pixel[k]])
+    intensity[:] = -lowest
+    items[0] = ROW
+    count, time, row, brightest = 1, 0, -1, 0
+    for k in range(len(p)):
+        intensity[pixel[k]] += p[k]
+        brightest = max(brightest, intensity[pixel[k]])
+        while stamp[k] != time or pixel[k] // WIDTH != row:
+            row = pixel[k] // WIDTH
+            time = min(stamp[k], time + STEP)
+            items[count] = row << 18 | (time & 0xFFFF) << 2 | ROW
+            count += 1
+        items[count] = (WHITE - intensity[pixel[k]]) << 16 | pixel[k] % WIDTH << 5 | COLUMN
+        count += 1
+    return count, brightest
 
 
 def _packed(words: Int64[np.ndarray, " words"]) -> UInt8[np.ndarray, "groups 7"]:

@@ -82,7 +82,7 @@ def block_text(table: Mapping[str, Any], results: Results) -> str:
     """Markdown of a block for the content of its file."""
     section = table.get("section")
     if not results or (section and section not in results):
-        return "Not measured yet; `python -m studies.measure` measures it."
+        return "Not measured yet."
     parts = []
     if "columns" in table:
         parts.append(markdown(table["columns"], list(rows_of(table["rows"], results)), results))

@@ -4,7 +4,7 @@
   next stage would, an artefact must be refused with one line that names the file or the folder, or give the same values
   as before. --runs names projects with a finished run (`polarnet preset smoke`, then `dvc repro`); the first is
   damaged, the others, such as one with seed=2, serve for exchanges.
-- kills: writers are killed at a random rename. The old or the new result must be whole, and a rerun must work.
+- kills: writers of stores are killed at a random rename. The old or the new one must be whole, a rerun must work.
 - names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
 - pairs: two commands at once write to one place of the first of --runs (`studies.pairs`).
 
@@ -32,7 +32,6 @@ import torch
 
 from polarnet import cli
 from polarnet.benchmark.results import read_record, read_rows
-from polarnet.cli.outputs import run_folder
 from polarnet.config.origins import Run
 from polarnet.config.tree import load
 from polarnet.events.stream import Events
@@ -51,6 +50,7 @@ from studies.pairs import pairs
 from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
+MAX_RENAMES = 51  # of `write_store` on an old store
 TEXTS = (".json", ".csv", "SHA256SUMS")
 SECTIONS = ("artefacts", "kills", "names", "pairs")
 FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
@@ -105,9 +105,19 @@ PLACES = {
 """Folders of each kind of artefact, below `paths.data`."""
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Every file of an artefact."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
 def files_in(folder: Path) -> list[Path]:
     """Files of an artefact that have content."""
-    return sorted(path for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
+    return [path for path, content in contents(folder).items() if content]
+
+
+def one_of(things: Sequence[Any], generator: Generator) -> Any:
+    """A random one."""
+    return things[int(generator.integers(len(things)))]
 
 
 def flip(content: bytes, generator: Generator) -> bytes:
@@ -123,51 +133,41 @@ def truncation(content: bytes, generator: Generator) -> bytes:
 
 def digit(content: bytes, generator: Generator) -> bytes:
     """One other digit; content without digits stays."""
-    places = [place for place, byte in enumerate(content) if 48 <= byte <= 57]
-    if not places:
-        return content
-    place = places[int(generator.integers(len(places)))]
-    return content[:place] + bytes([48 + (content[place] - 47) % 10]) + content[place + 1 :]
+    if places := [place for place, byte in enumerate(content) if 48 <= byte <= 57]:
+        place = one_of(places, generator)
+        content = content[:place] + bytes([48 + (content[place] - 47) % 10]) + content[place + 1 :]
+    return content
 
 
 def one_file(change: Callable[[bytes, Generator], bytes], endings: tuple[str, ...] = ("",)) -> Fault:
     """The fault that changes one file whose name has one of these endings."""
 
     def fault(folder: Path, others: Sequence[Path], generator: Generator) -> None:
-        files = [file for file in files_in(folder) if file.name.endswith(endings)]
-        if files:
-            file = files[int(generator.integers(len(files)))]
+        if files := [file for file in files_in(folder) if file.name.endswith(endings)]:
+            file = one_of(files, generator)
             file.write_bytes(change(file.read_bytes(), generator))
 
     return fault
 
 
-def deletion(folder: Path, others: Sequence[Path], generator: Generator) -> None:
-    """One file less."""
-    files = files_in(folder)
-    files[int(generator.integers(len(files)))].unlink()
-
-
 def exchange_of_files(folder: Path, others: Sequence[Path], generator: Generator) -> None:
     """One file replaced by another of its kind, in this artefact or in another of its kind."""
-    files = files_in(folder)
-    file = files[int(generator.integers(len(files)))]
-    alike = [one for place in (folder, *others) for one in files_in(place) if one.suffix == file.suffix and one != file]
-    if alike:
-        shutil.copy(alike[int(generator.integers(len(alike)))], file)
+    file = one_of(files_in(folder), generator)
+    every = itertools.chain.from_iterable(map(files_in, (folder, *others)))
+    if alike := [one for one in every if one.suffix == file.suffix and one != file]:
+        shutil.copy(one_of(alike, generator), file)
 
 
 def exchange_of_artefacts(folder: Path, others: Sequence[Path], generator: Generator) -> None:
     """The whole artefact replaced by another of its kind, of this run or of one with another seed."""
     if others:
         shutil.rmtree(folder)
-        shutil.copytree(others[int(generator.integers(len(others)))], folder)
+        shutil.copytree(one_of(others, generator), folder)
 
 
 def without_seal(folder: Path, others: Sequence[Path], generator: Generator) -> None:
     """The seal or the origin removed or emptied, and then one other digit in a text."""
-    seals = [file for file in files_in(folder) if file.name in (SUMS, ORIGIN)]
-    for file in seals:
+    for file in [file for file in files_in(folder) if file.name in (SUMS, ORIGIN)]:
         file.unlink() if generator.random() < 0.5 else file.write_bytes(b"")
     one_file(digit, TEXTS)(folder, others, generator)
 
@@ -183,7 +183,7 @@ FAULTS: dict[str, Fault] = {
     "flipped bit": one_file(flip),
     "truncation": one_file(truncation),
     "other digit": one_file(digit, TEXTS),
-    "deletion": deletion,
+    "deletion": lambda folder, others, generator: one_of(files_in(folder), generator).unlink(),
     "exchange of files": exchange_of_files,
     "exchange of artefacts": exchange_of_artefacts,
     "no seal": without_seal,
@@ -193,7 +193,7 @@ FAULTS: dict[str, Fault] = {
 
 def outcome(use: Callable[[], str], folder: Path, undamaged: str) -> tuple[str, str]:
     """One of OUTCOMES for a damaged artefact, and the message."""
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = contents(folder)
     try:
         result = ("harmless", "") if use() == undamaged else ("silent", "other values")
     except REFUSALS as error:
@@ -201,9 +201,7 @@ def outcome(use: Callable[[], str], folder: Path, undamaged: str) -> tuple[str, 
         result = ("refused" if named and "\n" not in str(error) else "unnamed"), str(error)
     except Exception as error:
         result = "traceback", repr(error)
-    changed = {path for path in folder.rglob("*") if path.is_file()} != {*before}
-    lost = changed or any(path.read_bytes() != content for path, content in before.items())
-    return ("lost", "the reader changed files") if lost else result
+    return result if contents(folder) == before else ("lost", "the reader changed files")
 
 
 def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict[str, int]], list[str]]:
@@ -225,7 +223,7 @@ def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict
         sound = {folder: values_of(kind, folder) for kind, folder in found}
         for number in range(faults):
             kind, folder = found[number % len(found)]
-            name = [*FAULTS][int(generator.integers(len(FAULTS)))]
+            name = one_of([*FAULTS], generator)
             others = [other for one, other in found if one == kind and other != folder]
             others += [run / "data" / folder.relative_to(data) for run in runs[1:]]
             kept = shutil.copytree(folder, Path(scratch, "kept"))
@@ -245,25 +243,12 @@ def inject(runs: Sequence[Path], faults: int, seed: int) -> tuple[dict[str, dict
     return dict(sorted(counts.items())), lines
 
 
-def write_folder(place: Path, value: str) -> None:
-    """A run of a command that writes 30 files of a value."""
-    with run_folder(place, "recover") as partial:
-        for number in range(30):
-            (partial / f"{number}.txt").write_text(value)
-
-
-def read_folder(place: Path) -> set[str]:
-    """The values in the folder of a command."""
-    return {file.read_text() for file in place.glob("*.txt")}
-
-
 def write_store(place: Path, value: str, names: Sequence[str] = ("a", "b", "c")) -> None:
     """A store with a value as its attribute and in its events, a part for each name."""
     store = EventStore.create(place, names, 8, 9, {"value": value})
     for name in store.missing():
-        t = torch.full((50,), int(value))
-        x = torch.ones(50)
-        store.write(name, [Events(t, x.short(), x.short(), x.to(torch.int8), 8, 9)] * 4, 5000)
+        x = np.ones(50, int)
+        store.write(name, [Events.from_columns(int(value) * x, x, x, x, 8, 9)] * 4, 5000)
     store.finish()
 
 
@@ -273,19 +258,8 @@ def read_events(place: Path) -> set[str]:
     return {str(int(t)) for name in store.sequences for t in store.read(name)[0].t} | {store.attributes["value"]}
 
 
-WRITERS: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], set[str]]]] = {
-    "folder of a command": (write_folder, read_folder),
-    "store": (write_store, read_events),
-}
-"""Writers that are killed while they replace an old result with a new one, and readers of the values there."""
-NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
-NAMES += ["b\x00", "b\n", "b\u202e", "b\u2028"]
-COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
-"""Commands that read a store whole, and what follows its name."""
-
-
-def killed_write(write: Callable[[Path, str], None], place: Path, value: str, after: int) -> None:
-    """In a process of its own: write, and die by SIGKILL before call `after` of a rename."""
+def killed_write(place: Path, value: str, after: int) -> None:
+    """In a process of its own: write a store, and die by SIGKILL before call `after` of a rename."""
     calls = itertools.count()
 
     def dying(call: Callable[..., Any]) -> Callable[..., Any]:
@@ -297,57 +271,69 @@ def killed_write(write: Callable[[Path, str], None], place: Path, value: str, af
         return call_or_die
 
     os.rename, os.replace, files._exchanged = dying(os.rename), dying(os.replace), dying(files._exchanged)
-    write(place, value)
+    write_store(place, value)
 
 
 def kills(cases: int) -> dict[str, dict[str, int]]:
-    """Outcomes of writers killed at any rename: the old or the new result is whole, or lost; no rerun works: stuck."""
-    counts = {f"kill of a {name}": dict.fromkeys(("whole", "lost", "stuck"), 0) for name in WRITERS}
-    for name, (write, read) in WRITERS.items():
-        with tempfile.TemporaryDirectory() as scratch:
-            place, value = Path(scratch, "place"), 1
-            write(place, str(value))
-            for number in range(cases):
-                after = int(80 ** generator_for(number, name, "kill").random()) - 1  # folders have few renames
-                process = multiprocessing.get_context("fork").Process(
-                    target=killed_write, args=(write, place, str(value + 1), after)
-                )
-                process.start()
-                process.join()
-                what = "whole" if read(place) in ({str(value)}, {str(value + 1)}) else "lost"
-                value += 2
-                write(place, str(value))
-                counts[f"kill of a {name}"][what if read(place) == {str(value)} else "stuck"] += 1
-    return counts
+    """Outcomes of kills at any rename: the old or the new store is whole, or lost; no rerun works: stuck."""
+    counts, fork = dict.fromkeys(("whole", "lost", "stuck"), 0), multiprocessing.get_context("fork")
+    with tempfile.TemporaryDirectory() as scratch:
+        place = Path(scratch, "place")
+        write_store(place, "1")
+        for number in range(cases):
+            old, new, rerun = (str(2 * number + k) for k in (1, 2, 3))
+            after = int(generator_for(number, "store", "kill").uniform(0, MAX_RENAMES))
+            process = fork.Process(target=killed_write, args=(place, new, after))
+            process.start()
+            process.join()
+            what = "whole" if read_events(place) in ({old}, {new}) else "lost"
+            write_store(place, rerun)
+            counts[what if read_events(place) == {rerun} else "stuck"] += 1
+    return {"kill of a store": counts}
 
 
-def hostile_names(cases: int) -> dict[str, dict[str, int]]:
-    """Outcomes of commands on stores of a stranger, whose sequences have names that could be places.
+NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
+NAMES += ["b\x00", "b\n", "b\u202e", "b\u2028"]
+COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
+"""Commands that read a store whole, and what follows its name."""
+
+
+def hostile_names() -> dict[str, dict[str, int]]:
+    """Outcomes of commands on stores of a stranger, one for each of `NAMES`, that has a sequence of that name.
 
     A file that a command writes beside its folder counts as outside.
     """
     counts = {f"{word} of a store with hostile names": dict.fromkeys(("refused", *FAILURES), 0) for word in COMMANDS}
-    for number in range(cases):
-        generator = generator_for(number, "faults", "names")
-        with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
-            work = Path("a", "b", "work")
+    for name, (word, options) in itertools.product(NAMES, COMMANDS.items()):
+        with tempfile.TemporaryDirectory() as scratch:
+            work = Path(scratch, "a", "b", "work")
             work.mkdir(parents=True)
-            name = NAMES[int(generator.integers(len(NAMES)))].format(root=scratch)
             with mock.patch("polarnet.storage.parts.check_name", lambda name: name):
-                write_store(work / "events.zarr", "1", ["a", name])
+                write_store(work / "events.zarr", "1", ["a", name.format(root=scratch)])
             before = {*Path(scratch).rglob("*")}
-            for word, options in COMMANDS.items():
-                with contextlib.chdir(work), contextlib.redirect_stderr(io.StringIO()) as errors:
-                    try:
-                        what = "refused" if cli.main([word, "events.zarr", *options]) else "silent"
-                    except Exception:
-                        what = "traceback"
-                if what == "refused" and "expected a name" not in errors.getvalue():
-                    what = "unnamed"
-                new = {*Path(scratch).rglob("*")} - before
-                outside = any(not path.is_relative_to(Path(scratch, work)) for path in new)
-                counts[f"{word} of a store with hostile names"]["outside" if outside else what] += 1
+            with contextlib.chdir(work), contextlib.redirect_stderr(io.StringIO()) as errors:
+                try:
+                    what = "refused" if cli.main([word, "events.zarr", *options]) else "silent"
+                except Exception:
+                    what = "traceback"
+            if what == "refused" and "expected a name" not in errors.getvalue():
+                what = "unnamed"
+            if not all(path.is_relative_to(work) for path in {*Path(scratch).rglob("*")} - before):
+                what = "outside"
+            counts[f"{word} of a store with hostile names"][what] += 1
     return counts
+
+
+def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
+    """Counts over all kinds of faults."""
+    kinds = [one for name in SECTIONS for one in sections.get(name, {}).values()]
+    names = {"lost": "faults_lost", "silent": "silent_uses", "outside": "outside_writes", "traceback": "tracebacks"}
+    return {
+        "faults_injected": sum(sum(one.values()) for one in kinds),
+        "kinds": len(kinds),
+        "stuck": sum(one.get("stuck", 0) for one in kinds),
+        **{name: sum(one.get(what, 0) for one in kinds) for what, name in names.items()},
+    }
 
 
 def main() -> None:
@@ -356,13 +342,13 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
-    parser.add_argument("--kills", type=int, default=100, help="of each kind; and stores with hostile names")
+    parser.add_argument("--kills", type=int, default=100, help="of stores")
     parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
     arguments = arguments_of(parser)
     studies: dict[str, Callable[[], Mapping[str, Any]]] = {
         "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
         "kills": lambda: kills(arguments.kills),
-        "names": lambda: hostile_names(arguments.kills),
+        "names": hostile_names,
         "pairs": lambda: pairs(arguments.runs[0], arguments.pairs),
     }
     for name in [arguments.only] if arguments.only else studies:
@@ -371,21 +357,6 @@ def main() -> None:
         if arguments.write:
             known = {**read_results(ROOT, "reliability"), name: figures}
             write_section("reliability", name, figures, record, headlines(known))
-
-
-def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
-    """Counts over all kinds of faults."""
-    kinds = [one for name in SECTIONS for one in sections.get(name, {}).values()]
-    total = {what: sum(one.get(what, 0) for one in kinds) for what in FAILURES}
-    return {
-        "faults_injected": sum(sum(one.values()) for one in kinds),
-        "faults_lost": total["lost"],
-        "silent_uses": total["silent"],
-        "stuck": total["stuck"],
-        "outside_writes": total["outside"],
-        "tracebacks": total["traceback"],
-        "kinds": len(kinds),
-    }
 
 
 if __name__ == "__main__":

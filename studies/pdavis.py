@@ -28,38 +28,16 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, stoke
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import APPENDED, open_truth
 from studies.e2p_writer import WHITE, mosaicked, write_e2p
+from studies.recording_files import EXPOSURE_US, write_aedat2
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 MOSAIC_TEXT = "90 45 / 135 0"
 POLARIZERS_DEG, TRUE_DOLP = (0, 30, 90), 0.8
 SQUARE = 64  # pixels of the photograph, of which every other square lies behind the polarizer
 WARM_UP = 5  # windows, as in the benchmark
-EXPOSURE_US, RESET_LEVEL = 8000, 900
-JAER_HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
-
-Frames = UInt8[np.ndarray, "n h w"]
-Times = Int64[np.ndarray, " n"]
 
 
-def write_aedat2(path: Path, events: Events, t_us: Times, frames: Frames) -> None:
-    """As jAER writes a DAVIS: columns of events count from the right, those of samples from the left, rows from below.
-
-    A frame has a sample of each pixel after its reset and one after its exposure, whose middle is at `t_us`.
-    """
-    up = (events.height - 1 - events.y.numpy().astype(np.int64)) << 22
-    words = up | (events.width - 1 - events.x.numpy().astype(np.int64)) << 12 | (events.p.numpy() > 0).astype(int) << 11
-    entries = [np.stack([words, events.t.numpy()], axis=1)]
-    y, x = np.mgrid[: events.height, : events.width]
-    place = (1 << 31 | (events.height - 1 - y) << 22 | x << 12).ravel()
-    for middle, frame in zip(t_us, frames, strict=True):
-        signal = place | 1 << 10 | (RESET_LEVEL - frame.ravel().astype(np.int64))
-        for sample, time in ((place | RESET_LEVEL, middle - EXPOSURE_US // 2), (signal, middle + EXPOSURE_US // 2)):
-            entries.append(np.stack([sample, np.full(len(sample), time)], axis=1))
-    table = np.concatenate(entries)
-    path.write_bytes(JAER_HEADER + table[np.argsort(table[:, 1], kind="stable")].astype(">u4").tobytes())
-
-
-def write_aedat4(path: Path, events: Events, t_us: Times, frames: Frames) -> None:
+def write_aedat4(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], frames: UInt8[np.ndarray, "n h w"]) -> None:
     """As DV writes it, by its own library."""
     size = events.width, events.height
     config = dv_processing.io.MonoCameraWriter.Config("DAVIS346")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64, UInt8
 
 from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.formats.aedat3 import PACKET
@@ -18,6 +19,8 @@ from studies.rosbag_writer import array_bytes, write_arrays, write_packets
 
 PACKET_EVENTS = 10_000
 TEXT_LINES = 1_000_000  # formatted at a time
+EXPOSURE_US, RESET_LEVEL = 8000, 900  # of frames in AEDAT-2
+NO_TIMES, NO_FRAMES = np.empty(0, np.int64), np.empty((0, 1, 1), np.uint8)
 
 Writer = Callable[[Path, Events], object]
 
@@ -61,6 +64,26 @@ def aedat3_packet(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) ->
     """A packet of AEDAT 3.1."""
     entries = np.stack([x << 17 | y << 2 | p << 1 | 1, t], axis=1).astype("<u4")
     return PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
+
+
+def write_aedat2(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], frames: UInt8[np.ndarray, "n h w"]) -> None:
+    """As jAER writes a DAVIS: columns of events count from the right, those of samples from the left, rows from below.
+
+    A frame has a sample of each pixel after its reset and one after its exposure, whose middle is at `t_us`.
+    """
+    t, x, y, p = columns_of(events)
+    entries = [np.stack([events.height - 1 - y << 22 | events.width - 1 - x << 12 | p << 11, t], axis=1)]
+    y, x = np.mgrid[: events.height, : events.width]
+    place = (1 << 31 | (events.height - 1 - y) << 22 | x << 12).ravel()
+    for middle, frame in zip(t_us, frames, strict=True):
+        signal = place | 1 << 10 | (RESET_LEVEL - frame.ravel().astype(np.int64))
+        for sample, time in ((place | RESET_LEVEL, middle - EXPOSURE_US // 2), (signal, middle + EXPOSURE_US // 2)):
+            entries.append(np.stack([sample, np.full(len(sample), time)], axis=1))
+    table = np.concatenate(entries)
+    header = (
+        f"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis{events.width}blue\r\n#End Of ASCII Header\r\n"
+    )
+    path.write_bytes(header.encode() + table[np.argsort(table[:, 1], kind="stable")].astype(">u4").tobytes())
 
 
 def table_writer(name: str) -> Writer:
@@ -119,7 +142,6 @@ def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Wr
 
 
 PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
-AEDAT2 = "#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis{width}blue\r\n#End Of ASCII Header\r\n"
 AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
 FILES: dict[str, tuple[str, Writer]] = {
     "store": (".zarr", write_store),
@@ -129,17 +151,7 @@ FILES: dict[str, tuple[str, Writer]] = {
     "rosbag of EventPacket": ("", messages(write_packets, lambda *columns: ("evt3", 0, evt3(*columns)))),
     "aedat4": (".aedat4", with_faery),
     "aedat3": (".aedat", binary(AEDAT3, aedat3_packet, PACKET_EVENTS)),
-    "aedat2": (
-        ".aedat",
-        lambda path, events: binary(
-            AEDAT2,
-            lambda t, x, y, p: (
-                np.stack([events.height - 1 - y << 22 | events.width - 1 - x << 12 | p << 11, t], axis=1)
-                .astype(">u4")
-                .tobytes()
-            ),
-        )(path, events),
-    ),
+    "aedat2": (".aedat", lambda path, events: write_aedat2(path, events, NO_TIMES, NO_FRAMES)),
     "event_stream": (".es", with_faery),
     "evt": (".raw", binary(PROPHESEE.format(v="3.0"), evt3)),
     "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), lambda *columns: evt2(*columns).tobytes())),

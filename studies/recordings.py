@@ -1,4 +1,4 @@
-"""Speed and memory of recordings: python -m studies.recordings [--write] [--sections NAME ...] [--formats NAME ...]
+"""Speed and memory of recordings: python -m studies.recordings [--write] [--sections NAME ...]
 
 Sections of docs/results/recordings.json, each measured in processes of their own:
 
@@ -14,13 +14,10 @@ import argparse
 import functools
 import json
 import os
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import psutil
 import torch
@@ -30,7 +27,14 @@ from polarnet.events.stream import Events, concatenate
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.writers import FORMS
 from studies.recording_files import FILES
-from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, read_results, write_section
+from studies.study import (
+    arguments_of,
+    command_line,
+    in_own_process,
+    machine_record,
+    passed,
+    write_section,
+)
 
 COUNT, SMALL = 10_000_000, 20_000  # events; the small file compiles every kernel
 PART = 1_000_000  # events that are made at a time, and microseconds that they take
@@ -47,7 +51,6 @@ COMMANDS: dict[str, list[str]] = {
     "recover": ["--method", "highpass", "--mosaic", "90 45 / 135 0", "--write", "zarr", "--out", "OUT"],
 }
 MIB = 2**20
-SECTIONS = ("readers", "memory", "cases")
 
 
 def parts(count: int, height: int, width: int) -> Iterator[Events]:
@@ -133,31 +136,32 @@ def peak_of_array(path: str) -> float:
     return round(peak_mib(), 1)
 
 
-def measure_readers(formats: Collection[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Speed of the readers and writers of these formats, beside the known ones."""
-    files, writers = known.get("files", {}), known.get("writers", {})
-    for name in (name for name in FILES if name in formats):
-        files[name] = in_own_process("studies.recordings", "--one", "reader", name)
-        print(name, files[name], flush=True)
-    for form in (form for form in FORMS if form in formats):
-        writers[form] = in_own_process("studies.recordings", "--one", "writer", form)
-        print(form, writers[form], flush=True)
+def measured(task: str, about: str) -> Any:
+    """Result of a task of `ONE` in a process of its own."""
+    figure = in_own_process("studies.recordings", "--one", task, about)
+    print(task, about, figure, flush=True)
+    return figure
+
+
+def measure_readers() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Speed of the readers and writers."""
+    files = {name: measured("reader", name) for name in FILES}
+    writers = {form: measured("writer", form) for form in FORMS}
     return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
 
 
-def measure_memory(forms: Iterable[str], known: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Peak memory of the commands, and bytes an event of an array, beside the known ones of other formats."""
-    rows, arrays = known.get("commands", {}), known.get("bytes_per_event", {})
-    for form in forms:
+def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Peak memory of the commands, and bytes an event of an array."""
+    rows: dict[str, dict[str, int]] = {}
+    arrays = {}
+    for form in MEMORY_FORMS:
+        suffix, write = FORMS[form]
         peaks: dict[int, dict[str, float]] = {}
         for size in MEMORY_SIZES:
             with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, f"recording{FORMS[form][0]}")
-                FORMS[form][1](path, parts(size, *MEMORY_SENSOR), None)
-                peaks[size] = {
-                    name: in_own_process("studies.recordings", "--one", name, path) for name in (*COMMANDS, "array")
-                }
-            print(form, size, peaks[size], flush=True)
+                path = Path(folder, f"recording{suffix}")
+                write(path, parts(size, *MEMORY_SENSOR), None)
+                peaks[size] = {name: measured(name, str(path)) for name in (*COMMANDS, "array")}
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
         few, many = MEMORY_SIZES[1:]
@@ -169,12 +173,7 @@ def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
     """Tests of the reference cases."""
     if "POLARNET_SHARED" not in os.environ:
         raise SystemExit("--sections cases: set POLARNET_SHARED to the folder with cases/recordings")
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder, "report.xml")
-        command = [sys.executable, "-m", "pytest", "-q", "tests/recordings/test_cases.py", f"--junitxml={report}"]
-        subprocess.run(command, cwd=ROOT, check=False)
-        cases = ElementTree.parse(report).getroot().iter("testcase")
-        right = {str(case.get("name")): len(case) == 0 for case in cases}
+    right = passed("tests/recordings/test_cases.py")
     return {"right": right}, {"cases_right": sum(right.values()), "cases_total": len(right)}
 
 
@@ -186,12 +185,13 @@ ONE: dict[str, Callable[[str], Any]] = {
 }
 
 
+SECTIONS = {"readers": measure_readers, "memory": measure_memory, "cases": measure_cases}
+
+
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/recordings.json")
     parser.add_argument("--sections", nargs="*", choices=SECTIONS, default=SECTIONS)
-    everything = list(dict.fromkeys([*FILES, *FORMS]))
-    parser.add_argument("--formats", nargs="*", choices=everything, default=everything)
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
     if arguments.one:
@@ -199,13 +199,8 @@ def main() -> None:
         print(json.dumps(ONE[task](about)))
         return
     for section in arguments.sections:
-        record, known = machine_record(), read_results(ROOT, "recordings").get(section, {})
-        if section == "readers":
-            figures, headlines = measure_readers(arguments.formats, known)
-        elif section == "memory":
-            figures, headlines = measure_memory([name for name in MEMORY_FORMS if name in arguments.formats], known)
-        else:
-            figures, headlines = measure_cases()
+        record = machine_record()
+        figures, headlines = SECTIONS[section]()
         if arguments.write:
             write_section("recordings", section, figures, record, headlines)
 

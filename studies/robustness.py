@@ -1,8 +1,7 @@
 """Methods on photographs, on measured scenes and on other sensors, in one table.
 
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --measured FOLDER ... --work FOLDER
-    [--weights [NAME=]FILE ...] [--published firenet_published=FILE] [--split test|val] [--conditions NAME ...]
-    [--limit N] [--write]
+    [--weights [NAME=]FILE ...] [--split test|val] [--conditions NAME ...] [--limit N] [--set KEY=VALUE ...] [--write]
 python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] --work FOLDER --training FOLDER
 
 - `photographs`: a split (`experiment=photographs`) of --photographs; `photographs_large`: of both folders together.
@@ -45,7 +44,7 @@ from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
-from studies.study import arguments_of, command_line, machine_record, row_of, write_section
+from studies.study import arguments_of, command_line, machine_record, write_section
 
 OURS = "ours"
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
@@ -194,26 +193,20 @@ def table_of(scores: Scores) -> dict[str, Any]:
 
 def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
     """Figures of one row that stand above the sections of docs/results/robustness.json."""
-    figures: dict[str, Any] = {}
-    for name in ("photographs", "photographs_large"):
-        if name in tables:
-            figures[name] = {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
+    figures: dict[str, Any] = {
+        name: {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
+        for name in ("photographs", "photographs_large")
+        if name in tables
+    }
     if "measured" in tables:
         rows = tables["measured"]["rows"]
         best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
-        keys = ("mse_over_oracle_mean", "median_over_oracle_mean")
-        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best} | {
-            key: rows[row][key] for key in keys
-        }
+        ratios = {key: rows[row][key] for key in ("mse_over_oracle_mean", "median_over_oracle_mean")}
+        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best, **ratios}
         figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
-    if "sensors.default" in tables:
-        default = tables["sensors.default"]["rows"][row]["mse"]
-        relative = {
-            name.removeprefix("sensors."): table["rows"][row]["mse"] / default
-            for name, table in tables.items()
-            if name.startswith("sensors.")
-        }
-        figures["sensors"] = {"worst_over_default": max(relative.values())}
+    errors = {name: table["rows"][row]["mse"] for name, table in tables.items() if name.startswith("sensors.")}
+    if "sensors.default" in errors:
+        figures["sensors"] = {"worst_over_default": max(errors.values()) / errors["sensors.default"]}
     return figures
 
 
@@ -255,22 +248,17 @@ def main() -> None:
     parser.add_argument("--measured", type=Path, nargs="+", default=[], help="as ingest.source=polarization takes them")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--weights", nargs="+", default=[], metavar="[NAME=]FILE", help="default: the shipped weights")
-    parser.add_argument("--published", nargs="+", default=[], metavar="ROW=FILE", help="published weights of rows")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="values, rows with published weights")
     parser.add_argument("--training", type=Path, help="folder for links to the training photographs")
     parser.add_argument("--split", choices=("test", "val"), default="test", help="split of the photographs")
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=1, help="processes that share the sequences")
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
     record = machine_record()
-    common = [f"runtime.threads={arguments.threads}", f"runtime.workers={arguments.workers}"]
-    for row, _, file in (given.partition("=") for given in arguments.published):
-        common.append(row_of(row, Path(file)))
-    config = settings(*common)
+    config = settings(*arguments.set)
     configure(config.runtime, config.seed)
     arguments.work.mkdir(parents=True, exist_ok=True)
     given = {"rgb": arguments.photographs, "more": arguments.photographs_large}
@@ -290,7 +278,7 @@ def main() -> None:
         conditions = {
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
-    tables = tables_of(conditions, means, train_mean, arguments.weights, common)
+    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set)
     figures = headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}

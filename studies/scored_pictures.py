@@ -3,6 +3,8 @@
 import csv
 import dataclasses
 import json
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
-from studies.study import ROOT, run_stage
+from studies.study import ROOT
 
 
 def settings(*overrides: str) -> Config:
@@ -28,8 +30,8 @@ def settings(*overrides: str) -> Config:
 def ingested(root: Path, folder: Path, *overrides: str) -> Path:
     """Folder of the pictures of `root`, made by stage ingest if missing."""
     if not (folder / "images" / MANIFEST).exists():
-        common = ("experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides)
-        run_stage("ingest", *common)
+        given = ["experiment=photographs", f"ingest.root={root}", f"paths.data={folder}", *overrides]
+        subprocess.run([sys.executable, "-m", "stages.ingest", *given], cwd=ROOT, check=True)
     return folder / "images"
 
 

@@ -4,18 +4,15 @@ The scene drifts from right to left. A bright stripe runs above it, and a dark l
 right. Each capture starts at a random time before the landmark.
 """
 
-import dataclasses
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt16
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
-from torch import Tensor
+from jaxtyping import Float64, Int64, UInt16
 
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
@@ -23,13 +20,12 @@ from polarnet.events.stream import Events, merge, select
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
-from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import HARMONICS, Pose, Sine, Trajectory, render
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene
-from studies.celex5_writer import write_celex5_bin, write_celex5_csv, write_celex5_pictures
+from studies.celex5_writer import write_celex5_bin, write_celex5_pictures
 
 STRIPE_S0, LANDMARK_S0 = 0.8, 0.04  # unpolarized
 SHORTEST_DELAY_S = 0.08  # from the start of a capture to the landmark
@@ -38,25 +34,22 @@ BORDER = 2  # margin of the scene around the area that the sensor sees, in pixel
 _STILL = Sine(0.0, 0.0, 0.0)
 
 
-@section
-class RigConfig:
+class RigConfig(NamedTuple):
     """Motion of the rig and noise of its camera; RecordingsConfig gives sensor, region, crop and size."""
 
-    speed_px_s: PositiveFloat
+    speed_px_s: float
     """Speed of the image on the sensor, in sensor pixels per second."""
-    longest_delay_s: Annotated[float, Field(gt=SHORTEST_DELAY_S)]
-    """Maximum time from the random start of a capture to the landmark."""
-    duration_s: PositiveFloat
+    longest_delay_s: float
+    """Maximum time from the random start of a capture to the landmark; more than `SHORTEST_DELAY_S`."""
+    duration_s: float
     """Duration of a capture after the landmark."""
-    picture_rate_hz: PositiveFloat
-    full_well_electrons: PositiveFloat
+    picture_rate_hz: float
+    full_well_electrons: float
     """Electrons collected by a white pixel of an intensity capture; sets the shot noise."""
-    read_noise: NonNegativeFloat
+    read_noise: float
     """Read noise of an intensity image, in steps of 12 bits."""
-    hot_pixels: NonNegativeInt
+    hot_pixels: int
     """Number of hot pixels, the same in all four event captures; each fires a few thousand times a second."""
-    file_type: Annotated[str, one_of(("bin", "csv"))]
-    """File type of the event captures; intensity captures are always BIN."""
 
 
 class RigTruth(NamedTuple):
@@ -113,8 +106,7 @@ def write_rig(
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
         noisy = merge([events, _hot_events(hot, total_us, height, width, generator)])
         begin_us = landmark_us - start_us[capture]
-        write = write_celex5_bin if config.file_type == "bin" else write_celex5_csv
-        write(folder / f"{capture}.{config.file_type}", shifted(select(noisy, noisy.t >= begin_us), begin_us))
+        write_celex5_bin(folder / f"{capture}.bin", shifted(select(noisy, noisy.t >= begin_us), begin_us))
     for polarizer, capture in enumerate(INTENSITY_CAPTURES):
         begin_us = landmark_us - start_us[capture]
         count = int((total_us - begin_us) * 1e-6 * config.picture_rate_hz)
@@ -144,28 +136,6 @@ def rig_scene(
         (_STILL,) * HARMONICS, (_STILL,) * HARMONICS, _STILL, _STILL, config.speed_px_s,
     )  # fmt: skip
     return PolarizationScene(torch.from_numpy(scene)), path
-
-
-def true_intensity(
-    truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig
-) -> Float32[Tensor, "n 4 h w"]:
-    """Noiseless intensities in [0, 1] of the reduced crop behind each polarizer; times count from the landmark."""
-    (height, width), (top, left) = recordings.crop, recordings.crop_corner
-    # offset from the centre of the sensor to the centre of the crop
-    right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
-    path = dataclasses.replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
-    frames = []
-    for t in t_us.tolist():
-        stokes_frame = render(truth.scene, path, np.array([(t + truth.landmark_us) * 1e-6]), height, width)[0]
-        planes = np.ascontiguousarray(stokes.intensities_from_stokes(stokes_frame).clamp(0, 1).permute(1, 2, 0).numpy())
-        small = cv2.resize(planes, tuple(recordings.size[::-1]), interpolation=cv2.INTER_AREA)
-        frames.append(torch.from_numpy(small).permute(2, 0, 1))
-    return torch.stack(frames)
-
-
-def true_dolp(truth: RigTruth, t_us: Int64[np.ndarray, " n"], recordings: RecordingsConfig) -> Float32[Tensor, "n h w"]:
-    """DoLP of `true_intensity`."""
-    return stokes.dolp(stokes.stokes_from_intensities(true_intensity(truth, t_us, recordings))).clamp(0, 1)
 
 
 def _landmark_us(scene: PolarizationScene, path: Drift, recordings: RecordingsConfig) -> int:
@@ -203,20 +173,7 @@ def _pictures(
 def _hot_events(
     hot: frozenset[tuple[int, int]], total_us: int, height: int, width: int, generator: np.random.Generator
 ) -> Events:
-    times, pixels = [np.empty(0, np.int64)], [np.empty((0, 2), np.int16)]
-    for pixel in sorted(hot):
-        count = generator.poisson(generator.uniform(*HOT_HZ) * total_us * 1e-6)
-        times.append(generator.integers(0, total_us, count))
-        pixels.append(np.tile(np.array(pixel, np.int16), (count, 1)))
-    t, yx = np.concatenate(times), np.concatenate(pixels)
-    order = np.argsort(t, kind="stable")
-    p = np.where(generator.random(len(t)) < 0.5, np.int8(1), np.int8(-1))
-    y, x = np.ascontiguousarray(yx[order].T)
-    columns = [torch.from_numpy(column) for column in (t[order], x, y, p)]
-    return Events(columns[0], columns[1], columns[2], columns[3], height, width)
-
-
-def spread_us(starts: Mapping[str, int], others: Mapping[str, int]) -> list[float]:
-    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
-    differences = np.array([starts[c] - others[c] for c in (*EVENT_CAPTURES, *INTENSITY_CAPTURES)], float)
-    return (differences - differences.mean()).tolist()
+    counts = generator.poisson(generator.uniform(*HOT_HZ, len(hot)) * total_us * 1e-6)
+    y, x = generator.permutation(np.repeat(np.array(sorted(hot)).reshape(-1, 2), counts, axis=0)).T
+    t = np.sort(generator.integers(0, total_us, len(x)))
+    return Events.from_columns(t, x, y, generator.choice([-1, 1], len(x)), height, width)

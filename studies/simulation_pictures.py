@@ -18,27 +18,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, select, slice_time
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
-from polarnet.reports.figures import LIGHT, show_picture, styled
-from polarnet.reports.maps import event_image, png
-from polarnet.simulation.camera import Camera
+from polarnet.reports.figures import LIGHT, styled
+from polarnet.reports.maps import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.motion import SynthesizeConfig, Trajectory, random_trajectory, sensor_to_scene
-from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.presets import MOTIONS, SENSORS
+from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
-from studies.overview import OFF, ON
 
+ON, OFF = "#d0312d", "#1f5fb8"
 FOLDER = Path("docs") / "pictures"
 PHOTO = next(photo.path for photo in BUILTIN_PHOTOS if photo.file == "coffee.png")
 DURATION_MS = 500
 RATE_HZ = 2000.0  # sampling rate of the light on the pixel
 PIXELS = 12  # number of pixels side by side under the same light, to show their differences
 QUIET = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
-WINDOW_US = (200_000, 233_333)
 COLOURS = 96  # palette size of a picture on disk
 LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
 
@@ -52,30 +47,6 @@ VARIATIONS = {
     "shot noise": (("shot_noise_rate_hz",), (0.0, 20.0, 80.0), " Hz"),
 }
 """Parameters of the pixel, and their values and unit in a picture."""
-SETTINGS: Mapping[str, dict[str, Any]] = {
-    "noiseless": {},
-    "threshold 0.1": {"contrast_threshold_on": 0.1, "contrast_threshold_off": 0.1},
-    "threshold 0.4": {"contrast_threshold_on": 0.4, "contrast_threshold_off": 0.4},
-    "mismatch 0.08": {"contrast_threshold_sigma_on": 0.08, "contrast_threshold_sigma_off": 0.08},
-    "bandwidth 20 Hz": {"cutoff_hz": 20.0},
-    "refractory 20 ms": {"refractory_period_us": 20_000.0},
-    "leak 5 Hz": {"leak_rate_hz": 5.0},
-    "shot noise 10 Hz": {"shot_noise_rate_hz": 10.0},
-    "all of v2e's noise": {
-        "contrast_threshold_sigma_on": 0.03,
-        "contrast_threshold_sigma_off": 0.03,
-        "cutoff_hz": 300.0,
-        "leak_rate_hz": 0.01,
-        "leak_jitter": 0.1,
-        "noise_rate_cov_decades": 0.1,
-        "shot_noise_rate_hz": 0.001,
-        "refractory_period_us": 500.0,
-    },
-    "v2e": {"model": "v2e"},
-    "esim": {"model": "esim"},
-    "dvs_voltmeter": {"model": "dvs_voltmeter"},
-}
-"""Tiles of the window picture: the changes of each to a noiseless `exact` pixel."""
 
 
 def drawn(width: float, height: float) -> Callable[[Callable[[Figure], None]], Callable[[], Figure]]:
@@ -105,10 +76,9 @@ def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, 
 
 
 def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
-                 pixels: int = 1, key: int = 5, eight_bit: bool = False) -> Events:  # fmt: skip
+                 pixels: int = 1, key: int = 5) -> Events:  # fmt: skip
     """Events of neighbouring pixels under one light."""
     frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
-    frames = frames.round().to(torch.uint8) if eight_bit else frames
     (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=key)
     return events
 
@@ -168,53 +138,6 @@ def crossings_figure(figure: Figure) -> None:
     stamps.grid(visible=False)
 
 
-@drawn(9.0, 5.1)
-def window_figure(figure: Figure) -> None:
-    """Draw one thirtieth of a second of the coffee photograph's events, behind the polarizer at 0 degrees."""
-    scene = photograph()
-    motion = replace(MOTIONS["default"], sensor_height=100, sensor_width=150, speed_min_px_s=150.0)
-    trajectory = random_trajectory(motion, scene.height, scene.width, np.random.default_rng(4))
-    for axes, (label, changes) in zip(figure.subplots(3, 4).ravel(), SETTINGS.items(), strict=True):
-        events = emulate_motion(Camera(replace(QUIET, **changes), key=1), scene, trajectory, WINDOW_US[1], (100, 150))[
-            0
-        ]
-        window = slice_time(events, *WINDOW_US)
-        show_picture(axes, event_image(polarity_sums(window), 3.0), LIGHT)
-        axes.set_title(label, loc="left", fontsize=9)
-        axes.set_xlabel(f"{len(window):,} events", color=LIGHT.quiet, fontsize=7)
-
-
-@drawn(9.0, 1.75)
-def motion_figure(figure: Figure) -> None:
-    """Draw the sensor's path over a picture for several values of the motion parameters."""
-    picture = read_rgb(PHOTO).permute(1, 2, 0).numpy()
-    default = MOTIONS["default"]
-    motions = {
-        "40 to 50 px/s": replace(default, speed_min_px_s=40.0, speed_max_px_s=50.0),
-        "250 to 300 px/s": replace(default, speed_min_px_s=250.0, speed_max_px_s=300.0, acceleration_max_px_s2=4000.0),
-        "rotation up to 40°": replace(default, rotation_max_deg=40.0),
-        "zoom up to 2.5": replace(default, zoom_max=2.5),
-    }
-    for axes, (label, motion) in zip(figure.subplots(1, 4), motions.items(), strict=True):
-        show_picture(axes, picture[::2, ::2], LIGHT)
-        axes.images[0].set_extent((-0.5, picture.shape[1] - 0.5, picture.shape[0] - 0.5, -0.5))
-        trajectory = random_trajectory(motion, picture.shape[0], picture.shape[1], np.random.default_rng(4))
-        _way(axes, trajectory, motion)
-        axes.set_title(label, loc="left", fontsize=9)
-
-
-def _way(axes: Axes, trajectory: Trajectory, motion: SynthesizeConfig) -> None:
-    """Draw the path of the sensor's centre over a second, and its outline at five times, the last one strongest."""
-    pose = trajectory.pose(np.linspace(0, motion.duration_s, 200))
-    axes.plot(pose.x, pose.y, color="white", linewidth=1.6)
-    height, width = motion.sensor_height, motion.sensor_width
-    for k, place in enumerate(np.linspace(0, 199, 5).astype(int)):
-        left, top, along, across = sensor_to_scene(*(float(v[place]) for v in pose), height, width)
-        columns, rows = np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]]) * np.array([[width - 1], [height - 1]])
-        axes.plot(left + columns * along - rows * across, top + columns * across + rows * along, color="white",
-                  linewidth=1.0, alpha=0.3 + 0.7 * k / 4)  # fmt: skip
-
-
 def _light(axes: Axes, t_ms: Float64[np.ndarray, " n"], title: str) -> None:
     """Draw log light on the upper half of a panel; rows of events come below."""
     log = np.log(light_of_one_pixel(t_ms))
@@ -247,8 +170,6 @@ def few_colours(content: bytes, colours: int = COLOURS) -> bytes:
 FIGURES = {
     "simulation_parameters": parameters_figure,
     "simulation_crossings": crossings_figure,
-    "simulation_window": window_figure,
-    "simulation_motion": motion_figure,
 }
 
 

@@ -7,9 +7,11 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import torch
 
@@ -61,12 +63,6 @@ def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
     return arguments
 
 
-def run_stage(name: str, *overrides: str, environment: Mapping[str, str] | None = None) -> None:
-    """Run stage `name` of the pipeline with these overrides; CalledProcessError if it fails."""
-    command = [sys.executable, "-m", f"stages.{name}", *overrides]
-    subprocess.run(command, cwd=ROOT, env=environment or os.environ, check=True)
-
-
 def in_own_process(module: str, *words: object) -> Any:
     """What `python -m MODULE WORDS` prints as JSON in its last line; RuntimeError with its messages if it fails."""
     command = [sys.executable, "-m", module, *map(str, words)]
@@ -74,6 +70,15 @@ def in_own_process(module: str, *words: object) -> Any:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def passed(*tests: str) -> dict[str, bool]:
+    """Whether each case of these tests passed, by its name; a skipped one did not. Tests are named as pytest does."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        subprocess.run([sys.executable, "-m", "pytest", *tests, f"--junitxml={report}"], cwd=ROOT, check=False)
+        cases = ElementTree.parse(report).getroot().iter("testcase")
+        return {str(case.get("name")): len(case) == 0 for case in cases}
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:
@@ -103,11 +108,6 @@ def write_section(
     path.write_text(json.dumps(dict(sorted(known.items())), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     print(f"wrote section {section} of {path.relative_to(root)}; `python -m studies.docs` brings it into the pages")
     return path
-
-
-def row_of(row: str, file: Path) -> str:
-    """Override that gives a row of the tables a file of weights."""
-    return f"++rows.{row}={{needs: '{file.resolve()}', settings: methods.sharpening}}"
 
 
 SCORES = (

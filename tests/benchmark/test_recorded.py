@@ -22,9 +22,9 @@ from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.sets import make_folder_set
+from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from studies.e2p_writer import WHITE, mosaicked, write_e2p
-from studies.recorded import write_recordings
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
 
@@ -55,7 +55,15 @@ def made(project_root, tmp_path_factory):
     write_png(folder / "pictures" / "beach.png", dead_leaves(generator_for(1, "beach", "picture"), 100, 150), bits=8)
     config = load(project_root, TINY)
     make_folder_set(folder / "pictures", "photographs", folder / "set", config.recipe, config.mapper)
-    write_recordings(folder / "set", folder / "recordings")
+    events, frames = EventStore.open(folder / "set" / "events.zarr"), FrameStore.open(folder / "set" / "frames.zarr")
+    (name,) = events.sequences
+    truth = frames.frames(name)
+    s0 = (truth.intensity[:, 0] + truth.intensity[:, 2]).numpy()
+    levels = np.rint(WHITE * mosaicked(2 * truth.intensity.numpy()).clip(0, 1)).astype(np.uint8)
+    maps = s0, truth.dolp.numpy(), truth.aolp.numpy()
+    (folder / "recordings").mkdir()
+    path = folder / "recordings" / f"{name}.h5"
+    write_e2p(path, join_mosaic(events.read(name), MOSAIC), truth.t_us.numpy(), levels, maps)
     return folder
 
 

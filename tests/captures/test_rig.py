@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from polarnet import stokes
 from polarnet.benchmark.run import run_benchmark
 from polarnet.captures.dot import RecordingsConfig, find_captures
 from polarnet.captures.targets import calibrate_targets, import_targets
@@ -15,17 +16,36 @@ from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.recovery.inputs import Files, open_files
 from polarnet.reports.recordings import draw_calibration
+from polarnet.simulation.motion import render
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.frames import FrameStore
-from studies.simulated_rig import RigConfig, spread_us, true_dolp, write_rig
+from studies.simulated_rig import RigConfig, write_rig
 
 PICTURE_RATE_HZ = 60.0
 SMALL = {"enabled": True, "sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96],
          "size": [16, 24]}  # fmt: skip
 RIG = RigConfig(
     speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=PICTURE_RATE_HZ,
-    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3, file_type="bin",
+    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3,
 )  # fmt: skip
+
+
+def true_dolp(truth, t_us, recordings):
+    """DoLP of the noiseless intensities of the reduced crop; times count from the landmark."""
+    (height, width), (top, left) = recordings.crop, recordings.crop_corner
+    # offset from the centre of the sensor to the centre of the crop
+    right, down = left + (width - recordings.sensor[1]) / 2, top + (height - recordings.sensor[0]) / 2
+    path = replace(truth.path, x=truth.path.x + right, y=truth.path.y + down)
+    frames = render(truth.scene, path, (t_us + truth.landmark_us) * 1e-6, height, width)
+    intensities = stokes.intensities_from_stokes(frames).clamp(0, 1)
+    small = torch.nn.functional.adaptive_avg_pool2d(intensities, (recordings.size[0], recordings.size[1]))
+    return stokes.dolp(stokes.stokes_from_intensities(small)).clamp(0, 1)
+
+
+def spread_us(starts, others):
+    """Differences between two sets of start times, minus their mean: the zero of the clock is a convention."""
+    differences = np.array([starts[c] - others[c] for c in starts], float)
+    return (differences - differences.mean()).tolist()
 
 
 @pytest.fixture(scope="module")

@@ -120,7 +120,7 @@ def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_
 
 RIG = RigConfig(
     speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=60.0, full_well_electrons=20000.0,
-    read_noise=2.0, hot_pixels=3, file_type="bin",
+    read_noise=2.0, hot_pixels=3,
 )  # fmt: skip
 RIG_SIZE = {"sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96], "size": [16, 24]}
 

@@ -1,16 +1,11 @@
 import pytest
 
 from polarnet.simulation.presets import SENSORS
-from studies.camera import DEFECTS, STEP, analyzer_errors, quiet
-
-
-@pytest.mark.parametrize("defect", DEFECTS)
-def test_each_defect_of_the_camera_is_mended(defect):
-    assert DEFECTS[defect]()
+from studies.camera import FINE, analyzer_errors
 
 
 def test_a_dofp_sensor_is_calibrated_from_its_own_events_to_1_percent():
-    assert analyzer_errors(quiet(STEP), seed=2).abs().max() < 0.01
+    assert analyzer_errors(FINE, seed=2).abs().max() < 0.01
 
 
 @pytest.mark.parametrize("seed", [1, 2])

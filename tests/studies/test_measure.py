@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.reports.artefacts import git
 from studies import study
-from studies.measure import STUDIES, Study, command_of, finished, measure_ablation, measure_pipeline, timed_make
+from studies.measure import measure_pipeline, measure_run
 from studies.study import arguments_of, command_line, uncommitted, write_section
 
 IDENTITY = ("-c", "user.name=a", "-c", "user.email=a@b.c")
@@ -14,21 +14,6 @@ def commit_all(root):
     git(root, "init", "--quiet")
     git(root, "add", ".")
     git(root, *IDENTITY, "commit", "--quiet", "--allow-empty", "-m", "one")
-
-
-def test_the_minutes_of_a_target_are_those_of_its_stages(tmp_path):
-    (tmp_path / "Makefile").write_text(
-        "two:\n\t@echo \"Running stage 'ingest':\"\n\t@sleep 0.7\n\t@echo \"Running stage 'train':\"\n\t@sleep 0.7\n"
-        "none:\n\t@echo nothing to do\n"
-        "broken:\n\t@exit 3\n"
-    )
-    minutes, stages = timed_make("two", tmp_path)
-    assert list(stages) == ["ingest", "train"]
-    assert all(value == 0.01 for value in stages.values())  # 0.7 s, to a hundredth of a minute
-    assert minutes == pytest.approx(sum(stages.values()), abs=0.011)
-    assert timed_make("none", tmp_path)[1] == {}
-    with pytest.raises(RuntimeError, match="make broken failed in a fresh clone"):
-        timed_make("broken", tmp_path)
 
 
 def test_a_section_of_the_results_is_replaced_and_headlines_join_what_is_there(tmp_path):
@@ -44,22 +29,19 @@ def test_a_section_of_the_results_is_replaced_and_headlines_join_what_is_there(t
     }
 
 
-def test_a_study_is_finished_if_its_figures_name_the_present_commit(tmp_path):
+def test_a_finished_run_becomes_rows_scenes_and_pairs(tmp_path):
+    folder = tmp_path / "benchmark" / "sets" / "simulated"
+    folder.mkdir(parents=True)
+    row = {"mse": 0.5, "mse_ci": [0.4, 0.6]}
+    for name, content in {
+        "metrics": {"cf": row, "ours": row}, "cost": {"cf": {"params": 0}, "ours": {"params": 9}},
+        "details": {"scenes": {"a": {}, "b": {}}, "frames": 50, "paired": {"cf": {"mse": {"better": 2}, "ssim": {}}}},
+    }.items():  # fmt: skip
+        (folder / f"{name}.json").write_text(json.dumps(content))
     commit_all(tmp_path)
-    assert not finished("speed", "models", tmp_path)
-    write_section("speed", "models", {}, {"commit": git(tmp_path, "rev-parse", "HEAD")}, root=tmp_path)
-    assert finished("speed", "models", tmp_path)
-    git(tmp_path, *IDENTITY, "commit", "--quiet", "--allow-empty", "-m", "two")
-    assert not finished("speed", "models", tmp_path)
-
-
-def test_a_study_gets_the_options_that_it_takes():
-    given = {"photographs": "a", "measured": ["b", "c"], "work": "d", "photographs_large": None, "published": []}
-    command = command_of(STUDIES["robustness"], given)
-    assert command[1:] == [
-        "-m", "studies.robustness", "--write", "--photographs", "a", "--measured", "b", "c", "--work", "d",
-    ]  # fmt: skip
-    assert command_of(Study("rig", "recordings", "rig"), given)[1:] == ["-m", "studies.rig", "--write"]
+    written = json.loads(measure_run("paper", tmp_path, tmp_path).read_text())["paper_small"]
+    assert (written["scenes"], written["frames"], written["paired"]) == (2, 50, {"cf": {"better": 2}})
+    assert [(one["mse"], one["params"]) for one in written["rows"].values()] == [(0.5, 0), (0.5, 9)]
 
 
 def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
@@ -75,27 +57,6 @@ def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):
     assert "code.py" in uncommitted(tmp_path)
     with pytest.raises(RuntimeError, match="uncommitted changes"):
         measure_pipeline(tmp_path)
-
-
-def swept(root, write_trial, **mse):
-    (root / "conf" / "ablation").mkdir(parents=True)
-    for number, (name, value) in enumerate(mse.items()):
-        write_trial(
-            root / "sweep" / str(number), [f"ablation={name}", "paths.data=x"], test={"mse": value, "psnr": 15.0}
-        )
-        (root / "conf" / "ablation" / f"{name}.yaml").write_text(f"# @package _global_\n# Without {name}.\n")
-    commit_all(root)
-    return root / "sweep"
-
-
-def test_an_ablation_shows_the_unchanged_network_first_and_then_the_worst(tmp_path, write_trial):
-    with pytest.raises(RuntimeError, match="expected a finished job with ablation=nothing, got sums"):
-        measure_ablation(swept(tmp_path / "lacking", write_trial, sums=0.05), tmp_path / "lacking")
-    sweep = swept(tmp_path / "whole", write_trial, sums=0.05, scales=0.06, nothing=0.03)
-    rows = json.loads(measure_ablation(sweep, tmp_path / "whole").read_text())["ablation"]["rows"]
-    assert {name: (row["about"], row["mse"]) for name, row in rows.items()} == {
-        "nothing": ("Without nothing.", 0.03), "scales": ("Without scales.", 0.06), "sums": ("Without sums.", 0.05),
-    }  # fmt: skip
 
 
 def test_figures_of_a_changed_tree_may_be_measured_but_not_written(monkeypatch, capsys):

@@ -5,7 +5,7 @@ import pytest
 from polarnet.benchmark.score import FrameScore
 from studies.robustness import SENSORS, Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
-from studies.speed_of_network import EVENTS_PER_PIXEL, random_channels, windows_of
+from studies.speed import EVENTS_PER_PIXEL, random_channels, windows_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
 DOLP = {"pale": 0.03, "middle": 0.1, "strong": 0.5}

@@ -1,0 +1,158 @@
+"""Speed of the shipped network and of the emulator: python -m studies.speed [--only network|simulation] [--write]
+
+- network: windows a second on random events, for each size of sensor, many at once as in a file and one by one as from
+  a camera, with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write: docs/results/robustness.json,
+  section speed.
+- simulation: a sensor of 120 x 180 pixels drifts over the coffee photograph at 110 px/s for a second: 300 steps, four
+  channels. Times run from rendering to columns in memory and are medians of wall-clock time with compiled kernels.
+  Every model and number of threads runs in its own process; the processes take turns, so that other load affects all
+  of them alike. --write: docs/results/emulation.json.
+"""
+
+import argparse
+import json
+import resource
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from skimage import data
+
+from polarnet.config.tree import load
+from polarnet.events.stream import Events
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.networks.registry import load_network
+from polarnet.networks.weights import shipped_weights
+from polarnet.runtime.machine import configure, precision_on, tune, usable_cores
+from polarnet.simulation.camera import Camera
+from polarnet.simulation.motion import HARMONICS, Sine
+from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.scene import scene_from_rgb
+from studies.simulated_rig import Drift
+from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
+
+SIZES = ((120, 180), (260, 346), (480, 640))
+RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
+CPU = torch.device("cpu")
+EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
+WINDOW_US = round(1e6 / 30)
+HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
+MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
+THREADS = (1, 2)
+ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
+
+
+def windows_per_s(weights: Path, height: int, width: int, binning: int | None) -> dict[str, float]:
+    """Windows a second of the network on random events in memory, as precise as `recover`.
+
+    `file` takes as many at once as `recover` of a file, `camera` one after the other.
+    """
+    recoverer = dolp_recoverer(*load_network(weights), CPU, precision_on(CPU, "auto"), binning=binning)
+    rates = {}
+    for name, size, runs in (("file", recoverer.at_once(height, width), RUNS), ("camera", 1, TIMED_WINDOWS)):
+        count = size * (WARM_RUNS + runs)
+        windows = windows_of(random_channels(height, width, count), count)
+        state = recoverer.start(height, width)
+        for number in range(WARM_RUNS + runs):
+            if number == WARM_RUNS:
+                start = time.perf_counter()
+            state, _ = recoverer.step(state, windows[number * size : (number + 1) * size])
+        rates[name] = round(size * runs / (time.perf_counter() - start), 2)
+    return rates
+
+
+def random_channels(height: int, width: int, windows: int) -> list[Events]:
+    """Random events of four channels, as long as this number of windows."""
+    generator = np.random.default_rng(0)
+    count = windows * round(EVENTS_PER_PIXEL * height * width)
+
+    def random_channel() -> Events:
+        t = np.sort(generator.integers(0, windows * WINDOW_US, count))
+        y, x = (generator.integers(0, size, count) for size in (height, width))
+        return Events.from_columns(t, x, y, generator.choice([-1, 1], count), height, width)
+
+    return [random_channel() for _ in range(4)]
+
+
+def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
+    """The first windows of the channels, one after the other."""
+    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
+    return list(cutter.add(channels, windows * WINDOW_US))
+
+
+def measure_network(weights: Path, threads: int) -> dict[str, Any]:
+    """Windows a second by size of sensor, with and without blocks."""
+    config = load(ROOT, [f"runtime.threads={threads}"])
+    configure(config.runtime, config.seed)
+    kinds = {"pixels": None, "blocks": 2}
+    sizes = {
+        f"{height} x {width}": {kind: windows_per_s(weights, height, width, side) for kind, side in kinds.items()}
+        for height, width in SIZES
+    }
+    return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
+
+
+def measure_model(model: str, threads: int) -> dict[str, Any]:
+    """Seconds of each run, events and peak memory of one model in this process, which is set up as stages are."""
+    torch.set_num_threads(threads)
+    tune()
+    scene = scene_from_rgb(torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255)
+    x, y, still = (scene.width - 1) / 2, (scene.height - 1) / 2, Sine(0.0, 0.0, 0.0)
+    path = Drift(x, y, (still,) * HARMONICS, (still,) * HARMONICS, still, still, SPEED_PX_S)
+    camera, seconds = Camera(replace(SENSORS["default"], model=model), key=1), []
+    for _ in range(REPEATS + 1):  # the first compiles
+        start = time.perf_counter()
+        events = emulate_motion(camera, scene, path, DURATION_US, (HEIGHT, WIDTH), threads)
+        seconds.append(time.perf_counter() - start)
+    peak_mib = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    return {"seconds": seconds[1:], "events": sum(map(len, events)), "peak_mib": peak_mib}
+
+
+def measure_models() -> dict[str, dict[str, Any]]:
+    """Seconds on one and two threads, rate of events and peak memory by model."""
+    runs: dict[tuple[str, int], list[dict[str, Any]]] = {(model, t): [] for model in MODELS for t in THREADS}
+    for _ in range(ROUNDS):
+        for model, threads in runs:
+            runs[model, threads].append(in_own_process("studies.speed", "--one", model, threads))
+    seconds = {key: float(np.median([s for one in of_key for s in one["seconds"]])) for key, of_key in runs.items()}
+    return {
+        model: {
+            "seconds_1_thread": round(seconds[model, 1], 4),
+            "seconds_2_threads": round(seconds[model, 2], 4),
+            "mevents_per_s": round(runs[model, 1][0]["events"] / seconds[model, 1] * 1e-6, 2),
+            "peak_mib": runs[model, 1][0]["peak_mib"],
+        }
+        for model in MODELS
+    }
+
+
+def main() -> None:
+    """Measure, print and perhaps write."""
+    parser = command_line(__doc__, "docs/results/robustness.json and emulation.json")
+    parser.add_argument("--only", choices=("network", "simulation"))
+    parser.add_argument("--weights", type=Path, default=shipped_weights(), help="checkpoint; default: the shipped one")
+    parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    arguments = arguments_of(parser)
+    if arguments.one:
+        model, threads = arguments.one
+        print(json.dumps(measure_model(model, int(threads))))
+        return
+    for kind, (name, section) in {"network": ("robustness", "speed"), "simulation": ("emulation", "models")}.items():
+        if arguments.only in (None, kind):
+            record = machine_record()
+            network = kind == "network"
+            figures = measure_network(arguments.weights, arguments.threads) if network else measure_models()
+            print(json.dumps(figures, indent=1), flush=True)
+            if arguments.write:
+                write_section(name, section, figures, record)
+
+
+if __name__ == "__main__":
+    main()
