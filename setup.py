@@ -1,4 +1,4 @@
-"""Puts the settings into the wheel, as copies. Everything else stands in pyproject.toml."""
+"""Puts the settings and the pipeline into the wheel, as copies. Everything else stands in pyproject.toml."""
 
 import shutil
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SETTINGS = ("params.yaml", "conf/**/*.yaml")
+SETTINGS = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
 INSTALLED = Path("polarnet", "config", "settings")  # polarnet.terminal.installation.shipped_settings reads it
 
 

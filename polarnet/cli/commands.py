@@ -79,6 +79,15 @@ def _project(command: AddCommand) -> None:
         "preset smoke",
     )
     preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
+    new = command(
+        "new",
+        "project.new",
+        "write a project with the pipeline: dvc.yaml, params.yaml, conf, stages",
+        "new lake && cd lake && polarnet preset smoke && dvc repro",
+        description="Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages "
+        "run again after a change of requirements.txt, which names polarnet's version.",
+    )
+    new.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
 
 
 def _stores(command: AddCommand) -> None:

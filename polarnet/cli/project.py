@@ -1,16 +1,45 @@
-"""The clone around the current folder, and the command that writes its settings: preset."""
+"""The project around the current folder, and the commands that write one or its settings: new, preset."""
 
 import argparse
+import shutil
 from pathlib import Path
 
+from ruamel.yaml import YAML
+
+from polarnet import __version__
 from polarnet.config.experiments import group_of, write_preset
 from polarnet.terminal.installation import shipped_settings
+
+COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
+CODE = "polarnet/"
+"""Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `REQUIREMENTS`."""
+REQUIREMENTS = "requirements.txt"
+IGNORED = """/data/*
+!/data/*/
+/data/*/*
+!/data/external/*/
+/data/external/*/*
+!/data/**/README.md
+/outputs/
+__pycache__/
+"""
+DVC = "[core]\n    analytics = false\n    no_scm = true\n"  # `dvc init --force` in a Git repository replaces it
 
 
 def _clone() -> Path | None:
     here = Path.cwd().resolve()
     files = ("params.yaml", "dvc.yaml")
     return next((path for path in (here, *here.parents) if all((path / file).exists() for file in files)), None)
+
+
+def project_root() -> Path:
+    """The nearest folder at or above the current one with params.yaml and dvc.yaml; FileNotFoundError if none has."""
+    if clone := _clone():
+        return clone
+    raise FileNotFoundError(
+        f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {Path.cwd()} or above; "
+        f"run this command inside a clone"
+    )
 
 
 def settings_root() -> Path:
@@ -24,14 +53,38 @@ def working_folder() -> Path:
 
 
 def preset(options: argparse.Namespace) -> None:
-    """Write a preset into params.yaml; FileNotFoundError outside a clone."""
-    root = _clone()
-    if root is None:
-        raise FileNotFoundError(
-            f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {Path.cwd()} or above; "
-            f"run this command inside a clone"
-        )
+    """Write a preset into params.yaml."""
+    root = project_root()
     changed = write_preset(root, options.name)
     print(f"params.yaml now holds {group_of(root, options.name)} {options.name}: {len(changed)} values changed")
     for line in changed:
         print(f"  {line}")
+
+
+def new(options: argparse.Namespace) -> None:
+    """Write a project into a new or empty folder; ValueError for another one."""
+    folder: Path = options.folder
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder}: expected a new or an empty folder, got one with files; name another")
+    source = shipped_settings()
+    for path in (path for pattern in COPIED for path in sorted(source.glob(pattern))):
+        target = folder / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+    _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
+    (folder / ".dvc").mkdir()
+    for name, text in ((REQUIREMENTS, f"polarnet=={__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):
+        (folder / name).write_text(text, encoding="utf-8")
+    print(f"{folder}: run the pipeline with `cd {folder} && dvc repro`; values are in params.yaml")
+
+
+def _write_pipeline(source: Path, target: Path) -> None:
+    """Copy dvc.yaml with dependencies on polarnet's version in place of its files."""
+    yaml = YAML()
+    yaml.width = 120
+    pipeline = yaml.load(source)
+    del pipeline["artifacts"]
+    for stage in pipeline["stages"].values():
+        content = stage.get("do", stage)
+        content["deps"] = [REQUIREMENTS, *(one for one in content["deps"] if not one.startswith(CODE))]
+    yaml.dump(pipeline, target)

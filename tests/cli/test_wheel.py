@@ -11,8 +11,8 @@ import pytest
 
 pytestmark = pytest.mark.thorough
 
-SOURCES = ("polarnet", "stages", "studies", "conf", "params.yaml", "pyproject.toml", "setup.py", "MANIFEST.in",
-           "README.md", "LICENSE")  # fmt: skip
+SOURCES = ("polarnet", "stages", "studies", "conf", "params.yaml", "dvc.yaml", "pyproject.toml", "setup.py",
+           "MANIFEST.in", "README.md", "LICENSE")  # fmt: skip
 BUILD = "import setuptools.build_meta as backend; backend.build_{kind}({folder!r})"  # what pip calls
 
 
@@ -27,6 +27,9 @@ def distributions(project_root, tmp_path_factory):
             shutil.copytree(project_root / name, clone / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(project_root / name, clone / name)
+    for readme in project_root.glob("data/**/README.md"):
+        (clone / readme.relative_to(project_root)).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(readme, clone / readme.relative_to(project_root))
     sdist = built(clone, "sdist", root)
     with tarfile.open(sdist) as archive:
         archive.extractall(root, filter="data")
@@ -52,5 +55,6 @@ def test_the_wheel_holds_the_package_alone_with_the_settings(distributions, proj
     } == modules
     assert {name.split("/")[0] for name in names} == {"polarnet"}
     assert {"polarnet/networks/weights/polarnet.safetensors", "polarnet/reports/page.html.jinja"} <= names
-    expected = [project_root / "params.yaml", *project_root.glob("conf/**/*.yaml")]
+    patterns = ("params.yaml", "dvc.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
+    expected = [path for pattern in patterns for path in project_root.glob(pattern)]
     assert settings == {str(path.relative_to(project_root)): path.read_bytes() for path in expected}

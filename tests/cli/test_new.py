@@ -1,0 +1,55 @@
+"""A project that `polarnet new` writes runs the pipeline with an installed polarnet."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from ruamel.yaml import YAML
+
+from polarnet.cli import main
+
+
+@pytest.fixture
+def project(tmp_path):
+    assert main(["new", str(tmp_path / "lake")]) == 0
+    return tmp_path / "lake"
+
+
+def test_the_stages_depend_on_the_version_instead_of_the_code_and_presets_work(
+    project, project_root, monkeypatch, capsys
+):
+    yaml = YAML(typ="safe")
+    own, clone = (yaml.load(root / "dvc.yaml")["stages"] for root in (project, project_root))
+    assert list(own) == list(clone)
+    for name, stage in own.items():
+        deps = stage.get("do", stage)["deps"]
+        assert deps[0] == "requirements.txt"
+        assert not any("polarnet" in one or "module" in one for one in deps)
+        assert {key: value for key, value in stage.items() if key not in ("deps", "do")} == {
+            key: value for key, value in clone[name].items() if key not in ("deps", "do")
+        }
+    rows, others = (yaml.load(root / "params.yaml") for root in (project, project_root))
+    assert not any(row["needs"].startswith("polarnet/") for row in rows.pop("rows").values())
+    assert rows == {key: value for key, value in others.items() if key != "rows"}
+    monkeypatch.chdir(project)
+    assert main(["preset", "smoke"]) == 0
+    assert "params.yaml now holds experiment smoke" in capsys.readouterr().out
+
+
+@pytest.mark.thorough
+def test_dvc_runs_a_stage_in_it(project, project_root):
+    pytest.importorskip("dvc")
+    environment = os.environ | {
+        "PYTHONPATH": str(project_root),
+        "PATH": f"{os.path.dirname(sys.executable)}:{os.environ['PATH']}",
+    }
+    command = [sys.executable, "-m", "dvc", "repro", "--single-item", "ingest"]
+    subprocess.run(command, cwd=project, env=environment, check=True, capture_output=True)
+    assert (project / "data" / "images" / "manifest.json").exists()
+
+
+def test_a_folder_with_files_is_refused(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["new", str(tmp_path)]) == 1
+    assert "expected a new or an empty folder" in capsys.readouterr().err
