@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from polarnet.analysis.event_budget import sequence_at
 from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
@@ -36,11 +37,9 @@ from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
-from polarnet.simulation.camera import grid
 from polarnet.simulation.dataset import motion_over
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
@@ -155,17 +154,12 @@ def scored_sequence(
 
 
 def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:
-    """A stored scene under its motion, with the events of the configured camera and exact truth."""
+    """A stored scene with the events of the configured camera, which moves as when the scene was made."""
     scene, trajectory, _ = motion_over(scenes, name)
     t_us = torch.tensor(frame_times_us(config.synthesize))
     size = scenes.sensor_height, scenes.sensor_width
     events = emulate_motion(config.camera.drawn(config.seed, name), scene, trajectory, int(t_us[-1]), size, 1)
-    pixels = grid(scenes.attributes["layout"], *size)
-    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *pixels))
-    mask, crosstalk = scenes.read(name).valid if scenes.masked else None, scenes.attributes.get("crosstalk", 0.0)
-    valid = None if mask is None else valid_frames(mask, trajectory, t_us.tolist()[1:], pixels, crosstalk)
-    s0 = intensity[:, 0] + intensity[:, 2]
-    return TestSequence(name, scenes.scene_of[name], events, t_us, dolp, aolp, s0, valid)
+    return sequence_at(scenes, name, events, t_us)
 
 
 def warmup_windows(config: Config) -> int:

@@ -1,1 +1,1 @@
-"""Beyond the scores of a method: conditions of a comparison, recordings with truth."""
+"""Beyond the scores of a method: event budget, conditions of a comparison, recordings with truth."""

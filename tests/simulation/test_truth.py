@@ -13,11 +13,11 @@ from part_fixtures import files_of
 from PIL import Image
 from simulation_fixtures import REST, STILL
 
+from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.simulation.camera import IDEAL, Grid, grid, weights_of
-from polarnet.simulation.dataset import motion_over
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import channel_light
 from polarnet.simulation.presets import MOTIONS
@@ -242,6 +242,5 @@ def test_truth_at_any_time_is_that_of_the_stretched_scene(images, tmp_path):
     synthesize(synthesis, tmp_path / "scenes", tmp_path / "frames", map)
     scenes, frames = SceneStore.open(tmp_path / "scenes"), FrameStore.open(tmp_path / "frames")
     name = scenes.sequences[0]
-    scene, trajectory, _ = motion_over(scenes, name)
-    _, degree, _ = frames_of(scene, trajectory, frames.t_us(name).tolist(), 24, 36)
-    torch.testing.assert_close(degree, frames.frames(name).dolp, atol=1e-4, rtol=0)
+    result = sequence_at(scenes, name, [], frames.t_us(name))
+    torch.testing.assert_close(result.dolp, frames.frames(name, 1).dolp, atol=1e-4, rtol=0)
