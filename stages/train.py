@@ -1,4 +1,4 @@
-"""Events (data/events.zarr or emulated from data/scenes.zarr), data/frames.zarr -> data/train/NAME: a trained network.
+"""data/events.zarr, data/frames.zarr -> data/train/NAME: a trained network.
 
 `python -m stages.train` trains the DoLP network `network` into data/train/ours; `python -m stages.train baseline=NAME`
 trains a baseline, with the settings of section `baselines.NAME`.
@@ -9,11 +9,12 @@ from pathlib import Path
 
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
 from polarnet.metrics.similarity import Lpips
-from polarnet.runtime.machine import device_of, threads_of
+from polarnet.runtime.machine import device_of
+from polarnet.storage.events import EventStore
 from polarnet.training.engine.loop import LoopConfig, train
 from polarnet.training.engine.parallel import join, launched
 from polarnet.training.engine.recorder import Recorder
-from polarnet.training.engine.task import Task, describe, open_events, open_split
+from polarnet.training.engine.task import Task, describe, open_split
 
 
 @hydra_stage
@@ -24,9 +25,8 @@ def main(config: Config) -> None:
     device = device_of(config.runtime)
     join(device)
     settings, task = or_exit(lambda: _task(config))
-    paths, threads = config.paths, threads_of(config.runtime)
-    events = open_events(settings.data, paths.events, paths.scenes, config.camera, config.seed, threads)
-    split = open_split(events, paths.frames, task.encode)
+    paths = config.paths
+    split = open_split(EventStore.open(paths.events), paths.frames, task.encode)
     metadata = describe(task, split, settings, Path(paths.weights), config.seed, device)
     recorder = Recorder(Path(paths.train) / (config.baseline or DOLP_TRAINING), Path(paths.resume), metadata)
     train(task, split, settings, recorder, config.seed, device, config.runtime.workers)

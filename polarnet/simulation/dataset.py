@@ -1,4 +1,4 @@
-"""Emulation of a scene store: into an event store, part by part so that a run can resume, or in memory on the fly."""
+"""Emulation of a scene store: into an event store, part by part so that a run can resume."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events
 from polarnet.simulation.camera import Camera, channel_size, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
@@ -16,7 +16,6 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 
 Mapper = Callable[..., Iterable[Any]]
-CAPACITY = 8  # sequences in memory, about 25 MB each at 120x180 px and 2 million events
 
 
 def emulate_scenes(
@@ -94,32 +93,3 @@ def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, T
     scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
     scene = stretched(scene, scenes.dynamic_range(sequence))
     return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
-
-
-class EmulatedEvents:
-    """An `EventSource` that emulates in memory the same events that `emulate_scenes` would store.
-
-    Sequences are emulated as a whole, because the pixels have memory. The last `capacity` sequences stay in memory for
-    further reads. A copy in another process starts with none.
-    """
-
-    def __init__(self, scenes: SceneStore, camera: Camera, seed: int, threads: int = 1, capacity: int = CAPACITY):
-        self.path, self.sequences = scenes.path, scenes.sequences
-        self.height, self.width = channel_size(camera.polarizers.layout, scenes.sensor_height, scenes.sensor_width)
-        self.attributes = origin_of(scenes, camera, seed)
-        self._settings = scenes, camera, seed, threads, capacity
-        self._emulated = functools.lru_cache(capacity)(
-            lambda sequence: emulate_sequence(scenes, sequence, camera, seed, threads)
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), self._settings
-
-    def read(self, sequence: str, start_us: int | None = None, stop_us: int | None = None) -> list[Events]:
-        """Events of the four channels with start_us <= t < stop_us (default: all), in microseconds of the sequence.
-
-        Raises ValueError for a sequence that the scene store does not have.
-        """
-        channels, start_us = self._emulated(sequence), start_us or 0
-        stop_us = self._settings[0].duration_us(sequence) + 1 if stop_us is None else max(start_us, stop_us)
-        return [slice_time(events, start_us, stop_us) for events in channels]

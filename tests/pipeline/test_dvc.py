@@ -163,7 +163,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
         thorough("networks/registry.py", {"report"} | ROWS),
         thorough("training/dolp.py", {"train"}),
-        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | TRAININGS | ROWS) - {"ingest"}),
+        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"weights", "report"} | TRAININGS | ROWS),
         thorough("reports/charts.py", {"calibrate", "report"}),
         thorough("benchmark/results.py", {"report"} | ROWS),
@@ -190,7 +190,7 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
                                                     "report"}),
         thorough(put("loss", mse=12.0), {"train", "report"}),
         thorough(put("benchmark", bootstrap_samples=100), {"report"}),
-        thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"} | TRAININGS),
+        thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"}),
     ],
 )  # fmt: skip
 def test_a_changed_value_runs_what_it_can_change(project, change, stages):

@@ -29,7 +29,6 @@ from polarnet.training.engine.task import Task, describe, open_split
 SEED = 7
 CPU = torch.device("cpu")
 LOOP: dict[str, Any] = {
-    "data": "store",
     "visits": 2,
     "windows": 4,
     "crop": [16, 20],

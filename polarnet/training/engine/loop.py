@@ -47,8 +47,6 @@ Run = tuple[Tensor, Tensor, Tensor | None]
 class LoopConfig(ViewConfig):
     """Training settings shared by the sections `train`, `baselines.e2v` and `baselines.e2p` of params.yaml."""
 
-    data: Annotated[str, one_of(("store", "fly"))]
-    """store: read events from the store on disk; fly: emulate the same events in memory, from the scenes, on demand."""
     epochs: Annotated[int, Field(gt=0, le=100_000)]
     batch_size: Annotated[int, Field(gt=0, le=10_000)]
     """Number of visits to sequences in one batch."""

@@ -1,4 +1,4 @@
-"""Sequences of stored or emulated events with their truth, cut into encoded windows, and batches of them.
+"""Sequences of stored events with their truth, cut into encoded windows, and batches of them.
 
 Batches are augmented; the seed alone determines them.
 """
@@ -19,7 +19,6 @@ from polarnet.events.representations import Encode
 from polarnet.events.streaming import encode_windows
 from polarnet.runtime.machine import generator_for, memory, memory_handed_back, processes_here
 from polarnet.runtime.sections import section
-from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 
@@ -47,7 +46,7 @@ class WindowSequence(NamedTuple):
 class WindowDataset(Dataset[WindowSequence]):
     """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
 
-    def __init__(self, events: EventStore | EmulatedEvents, frames: FrameStore, sequences: list[str], encode: Encode):
+    def __init__(self, events: EventStore, frames: FrameStore, sequences: list[str], encode: Encode):
         if absent := [name for name in sequences if name not in set(events.sequences) & set(frames.sequences)]:
             raise ValueError(f"{', '.join(absent[:8])}: not both in {events.path} and in {frames.path}")
         if (events.height, events.width) != (frames.height, frames.width):

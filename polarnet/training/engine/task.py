@@ -16,11 +16,8 @@ from polarnet.metrics.lpips import NO_RECORD, stored_record
 from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
-from polarnet.simulation.camera import Camera
-from polarnet.simulation.dataset import EmulatedEvents
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.losses import FrameLoss
 from polarnet.training.engine.sequences import Batch, WindowDataset
 
@@ -81,16 +78,7 @@ class Split(NamedTuple):
     val: WindowDataset
 
 
-def open_events(
-    data: str, events: str, scenes: str, camera: Camera, seed: int, threads: int
-) -> EventStore | EmulatedEvents:
-    """Open the events: `store` reads them from disk, `fly` emulates them in memory. Both give identical events."""
-    if data == "store":
-        return EventStore.open(events)
-    return EmulatedEvents(SceneStore.open(scenes), camera, seed, threads)
-
-
-def open_split(events: EventStore | EmulatedEvents, frames: str, encode: Encode) -> Split:
+def open_split(events: EventStore, frames: str, encode: Encode) -> Split:
     """Open the training and validation sequences; ValueError if either split is empty."""
     frame_store = FrameStore.open(frames)
     names = {split: frame_store.of_split(split) for split in Split._fields}
@@ -127,7 +115,7 @@ def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, de
             "height": events.height,
             "width": events.width,
             "events_from": events.attributes,
-            "events_sha256": store_hash(events.path),  # with data=fly: hash of the scenes
+            "events_sha256": store_hash(events.path),
             "frames_sha256": store_hash(frames.path),
         },
         "versions": {"polarnet": __version__, "torch": torch.__version__},
