@@ -96,8 +96,8 @@ def options_figure(figure: Figure) -> None:
     t_us = np.arange(seconds * 1000 + 1) * 1000.0
     quiet = replace(QUIET, cutoff_hz=30.0)
     for model, colour, style in (("exact", COLOURS[1], "-"), ("v2e", COLOURS[3], "o")):
-        configs = [replace(quiet, model=model, photoreceptor_noise=deviation) for deviation in deviations]
-        counts = [len(events_under(np.full(len(t_us), 60.0), t_us, config, pixels)) for config in configs]
+        noisy = [replace(quiet, model=model, photoreceptor_noise=deviation) for deviation in deviations]
+        counts = [len(events_under(np.full(len(t_us), 60.0), t_us, config, pixels)) for config in noisy]
         rates = np.array(counts) / (2 * pixels * seconds)
         noise.semilogy(deviations, rates, style, color=colour, markersize=4, label=model)
     noise.plot(*V2E_NOISE, "x", color=ON, markersize=8, label="v2e's own program")
@@ -106,11 +106,12 @@ def options_figure(figure: Figure) -> None:
     noise.set_title("photoreceptor noise, 30 Hz, thresholds 0.2", loc="left", fontsize=9)
     t_us = np.arange(0, 6_001, 50.0)
     light = 60 * np.exp(t_us.clip(500, 1_500) / 1000 - 0.5)
-    sensors: tuple[dict[str, Any], ...] = ({}, {"refractory": "reset"}, {"model": "v2e"})
-    for options, colour in zip(sensors, (COLOURS[1], ON, COLOURS[3]), strict=True):
-        events = events_under(light, t_us, replace(QUIET, refractory_period_us=500.0, **options))
-        t_ms = events.t.numpy() / 1000
-        label = options.get("model") or f"exact, {options.get('refractory', 'keep')}"
+    keep = replace(QUIET, refractory_period_us=500.0)
+    reset, v2e = replace(keep, refractory="reset"), replace(keep, model="v2e")
+    for label, config, colour in (
+        ("exact, keep", keep, COLOURS[1]), ("exact, reset", reset, ON), ("v2e", v2e, COLOURS[3])
+    ):  # fmt: skip
+        t_ms = events_under(light, t_us, config).t.numpy() / 1000
         ramp.step(np.r_[0, t_ms, 6], np.r_[0, np.arange(1, len(t_ms) + 1), len(t_ms)], where="post", color=colour,
                   linewidth=1.4, label=label)  # fmt: skip
     ramp.plot(t_us / 1000, np.log(light / 60) / 0.2, label="log light / 0.2", **LINE)
