@@ -1,10 +1,10 @@
 """Write BIN and CSV files of a CeleX-5, for simulated cameras and for tests of the readers."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int, Int64, UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
 from polarnet.events.stream import Events, validate
 from polarnet.recordings.formats.celex5 import (
@@ -61,41 +61,29 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     return Events.from_columns(microseconds(stamp, clock_mhz), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
 
 
-def write_celex5_pictures(
-    path: Path, pictures: Iterable[UInt16[np.ndarray, "800 1280"]], t_us: Iterable[int] | None = None
-) -> None:
-    """Write full pictures of 0 to 4095 (brighter is larger), with the computer's time to the millisecond where given.
+def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800 1280"]], t_us: Sequence[int]) -> None:
+    """Write full pictures of 0 to 4095 (brighter is larger), with the computer's time to the millisecond.
 
     Pixel (0, 0) is lost, since the sensor stores its mode there.
     """
-    stamps = None if t_us is None else iter(t_us)
-    packages = 0
     with path.open("wb") as file:
-        file.write(_header(FULL_PICTURE, IMU if stamps else 0, 0))
-        for picture in pictures:
+        file.write(_header(FULL_PICTURE, IMU, len(t_us)))
+        for picture, t in zip(pictures, t_us, strict=True):
             if picture.shape != (HEIGHT, WIDTH) or picture.max() > WHITE:
                 raise ValueError(
                     f"expected pictures of {HEIGHT}x{WIDTH} up to {WHITE}, got {picture.shape} up to {picture.max()}"
                 )
-            file.write(LENGTH.pack(PICTURE_BYTES))
-            file.write(_packed_picture(picture).tobytes() + b"\0")
-            if stamps:
-                file.write(STAMP.pack(next(stamps) // 1000, 0))
-            packages += 1
-        file.seek(0)
-        file.write(_header(FULL_PICTURE, IMU if stamps else 0, packages))
+            file.write(LENGTH.pack(PICTURE_BYTES) + _packed_picture(picture).tobytes() + b"\0")
+            file.write(STAMP.pack(t // 1000, 0))
 
 
-def write_celex5_csv(path: Path, events: Events, intensity: Int[np.ndarray, " n"] | None = None) -> None:
+def write_celex5_csv(path: Path, events: Events) -> None:
     """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
 
-    `intensity` is the pixel's measurement, 0 to 4095; None writes half of the maximum. ValueError where events are not
-    on the sensor of 800 x 1280.
+    The intensity is half of the maximum. ValueError where events are not on the sensor of 800 x 1280.
     """
     _check_size(events)
-    adc = np.full(len(events), WHITE // 2) if intensity is None else np.asarray(intensity)
-    if len(adc) != len(events) or (len(adc) and not (adc.min() >= 0 and adc.max() <= WHITE)):
-        raise ValueError(f"expected an intensity of 0 to {WHITE} for each of {len(events)} events, got {len(adc)}")
+    adc = np.full(len(events), WHITE // 2)
     columns = [events.y.numpy(), events.x.numpy(), adc, events.p.numpy(), events.t.numpy()]
     with path.open("wb") as file:
         for start in range(0, len(events), CSV_LINES):

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
+from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.recordings.writers import h5py_module
@@ -42,7 +43,6 @@ def mosaicked(planes: np.ndarray) -> np.ndarray:
     """One mosaic 90 45 / 135 0 of twice the size, from n x 4 x h x w planes at 0, 45, 90 and 135 degrees."""
     n, _, height, width = planes.shape
     mosaic = np.empty((n, 2 * height, 2 * width), planes.dtype)
-    for row in (0, 1):
-        for column in (0, 1):
-            mosaic[:, row::2, column::2] = planes[:, MOSAIC[row][column] // 45]
+    for plane, (row, column) in zip(planes.swapaxes(0, 1), places_of(MOSAIC), strict=True):
+        mosaic[:, row::2, column::2] = plane
     return mosaic

@@ -33,7 +33,6 @@ from studies.study import (
 DEMO_METRICS = "data/benchmark/metrics.json"
 RUNS = {"paper": "paper_small", "benchmark": "simulated"}
 """Section of docs/results/NAME.json that a finished run fills, by NAME."""
-PICTURE_MODULES = ("overview", "simulation_pictures", "physics_pictures")
 
 
 def measure_pipeline(root: Path = ROOT) -> Path:
@@ -79,7 +78,7 @@ def measure_run(name: str, data: Path, root: Path = ROOT) -> Path:
 
 def draw_pictures() -> None:
     """Draw the pictures that show nothing but the simulation and the demo."""
-    for module in PICTURE_MODULES:
+    for module in ("overview", "simulation_pictures", "physics_pictures"):
         subprocess.run([sys.executable, "-m", f"studies.{module}"], cwd=ROOT, check=True)
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "polarnet.cli", "demo", "--out", folder], cwd=ROOT, check=True)

@@ -10,9 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from polarnet.config.tree import load
 from polarnet.methods.intensities import consistent
@@ -20,11 +18,7 @@ from polarnet.reports.figures import LIGHT, show_picture
 from polarnet.reports.maps import dolp_image
 from polarnet.simulation.pixels.light import respond
 from polarnet.simulation.pixels.physics import physics_of
-from polarnet.stokes import (
-    dolp,
-    intensities_from_stokes,
-    stokes_from_intensities,
-)
+from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities
 from studies.simulation_pictures import LINE, ON, QUIET, drawn, events_under, photograph, write_pictures
 from studies.study import ROOT
 
@@ -52,15 +46,12 @@ def gains_figure(figure: Figure) -> None:
     measured = (intensities_from_stokes(truth) + DARKEST) * noise
     wrong = measured * measured.new_tensor(WRONG_FACTORS)[:, None, None]
     solved = consistent(wrong[None], load(ROOT).methods.gain)[0]
-    panels = {"true": dolp(truth), "factors unknown": _dolp_of(wrong), "factors solved": _dolp_of(solved)}
+    unknown, factors = (dolp(stokes_from_intensities(one)) for one in (wrong, solved))
+    panels = {"true": dolp(truth), "factors unknown": unknown, "factors solved": factors}
     for axes, (name, degree) in zip(figure.subplots(1, 3), panels.items(), strict=True):
         show_picture(axes, dolp_image(degree), LIGHT)
         rms = float((degree.clamp(0, 1) - panels["true"]).square().mean().sqrt())
         axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
-
-
-def _dolp_of(intensities: Float64[Tensor, "4 h w"]) -> Float64[Tensor, "h w"]:
-    return dolp(stokes_from_intensities(intensities))
 
 
 @drawn(9.0, 2.9)

@@ -17,7 +17,6 @@ uint64 time_base
 string encoding
 bool is_bigendian
 uint8[] events"""
-ROS1_TIME = "time"
 
 
 def write_bag(
@@ -32,58 +31,58 @@ def write_bag(
 ) -> None:
     """Write rows t (microseconds), x, y, p to each topic: a message with all but the last, and one with the last.
 
-    `form` is ros1 or ros2; `plugin` the storage of ROS 2, sqlite3 or mcap.
+    `form` is ros1 (then `package` is dvs_msgs) or ros2; `plugin` the storage of ROS 2, sqlite3 or mcap.
     """
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
+    parts = rows[:-1], rows[-1:]
+    if form == "ros1":
+        contents = [array_bytes(*np.array(part, int).reshape(-1, 4).T) for part in parts]
+        write_arrays(path, height, width, contents, topics)
+        return
+    from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    old = form == "ros1"
-    store = get_typestore(Stores.ROS1_NOETIC if old else Stores.ROS2_HUMBLE)
+    store, array = get_typestore(Stores.ROS2_HUMBLE), f"{package}/msg/EventArray"
     for name, text in (("Event", EVENT), ("EventArray", EVENT_ARRAY)):
-        own = text.replace("builtin_interfaces/Time", ROS1_TIME) if old else text
-        store.register(get_types_from_msg(own, f"{package}/msg/{name}"))
-    kinds, array = store.types, f"{package}/msg/EventArray"
-    event, time, header = (
-        kinds[name] for name in (f"{package}/msg/Event", "builtin_interfaces/msg/Time", "std_msgs/msg/Header")
-    )
+        store.register(get_types_from_msg(text, f"{package}/msg/{name}"))
+    event, time = store.types[f"{package}/msg/Event"], store.types["builtin_interfaces/msg/Time"]
+    header = store.types["std_msgs/msg/Header"](stamp=time(sec=0, nanosec=0), frame_id="")
 
-    def message(some: Sequence[tuple[int, int, int, int]]) -> Any:
-        stamp = header(**({"seq": 0} if old else {}), stamp=time(sec=0, nanosec=0), frame_id="")
+    def message(part: Sequence[tuple[int, int, int, int]]) -> Any:
         events = [
-            event(x=x, y=y, ts=time(sec=t // 10**6, nanosec=t % 10**6 * 1000), polarity=p > 0) for t, x, y, p in some
+            event(x=x, y=y, ts=time(sec=t // 10**6, nanosec=t % 10**6 * 1000), polarity=p > 0) for t, x, y, p in part
         ]
-        return kinds[array](header=stamp, height=height, width=width, events=events)
+        return store.types[array](header=header, height=height, width=width, events=events)
 
-    serialize = store.serialize_ros1 if old else store.serialize_cdr
-    with Writer1(path) if old else Writer2(path, version=9, storage_plugin=StoragePlugin[plugin.upper()]) as bag:
+    with Writer(path, version=9, storage_plugin=StoragePlugin[plugin.upper()]) as bag:
         for topic in topics:
             connection = bag.add_connection(topic, array, typestore=store)
-            for k, some in enumerate((rows[:-1], rows[-1:])):
-                bag.write(connection, k, serialize(message(some), array))
+            for k, part in enumerate(parts):
+                bag.write(connection, k, store.serialize_cdr(message(part), array))
 
 
 def array_bytes(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
     """The events of an EventArray as ROS 1 serializes them: their number, then 13 bytes each."""
     records = np.empty(len(t), [("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
-    for name, values in zip(("x", "y", "s", "ns", "p"), (x, y, t // 10**6, t % 10**6 * 1000, p), strict=True):
+    for name, values in zip(("x", "y", "s", "ns", "p"), (x, y, t // 10**6, t % 10**6 * 1000, p > 0), strict=True):
         records[name] = values
     return struct.pack("<I", len(t)) + records.tobytes()
 
 
-def write_arrays(path: Path, height: int, width: int, contents: Iterable[bytes]) -> None:
-    """Write a ROS 1 bag with an EventArray of dvs_msgs for each of `array_bytes`."""
+def write_arrays(
+    path: Path, height: int, width: int, contents: Iterable[bytes], topics: Sequence[str] = ("/dvs/events",)
+) -> None:
+    """Write a ROS 1 bag with an EventArray of dvs_msgs in each topic for each of `array_bytes`."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC)
     for name, text in (("Event", EVENT), ("EventArray", EVENT_ARRAY)):
-        store.register(get_types_from_msg(text.replace("builtin_interfaces/Time", ROS1_TIME), f"dvs_msgs/msg/{name}"))
+        store.register(get_types_from_msg(text.replace("builtin_interfaces/Time", "time"), f"dvs_msgs/msg/{name}"))
     with Writer(path) as bag:
-        connection = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        connections = [bag.add_connection(topic, "dvs_msgs/msg/EventArray", typestore=store) for topic in topics]
         for k, content in enumerate(contents):
-            bag.write(connection, k, struct.pack("<6I", k, 0, 0, 0, height, width) + content)
+            for connection in connections:
+                bag.write(connection, k, struct.pack("<6I", k, 0, 0, 0, height, width) + content)
 
 
 def write_packets(path: Path, height: int, width: int, packets: Iterable[tuple[str, int, bytes]]) -> None:

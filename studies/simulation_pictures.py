@@ -26,9 +26,9 @@ from polarnet.reports.maps import png
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
+from studies.study import PICTURES
 
 ON, OFF = "#d0312d", "#1f5fb8"
-FOLDER = Path("docs") / "pictures"
 PHOTO = next(photo.path for photo in BUILTIN_PHOTOS if photo.file == "coffee.png")
 DURATION_MS = 500
 RATE_HZ = 2000.0  # sampling rate of the light on the pixel
@@ -176,7 +176,7 @@ FIGURES = {
 def write_pictures(figures: Mapping[str, Callable[[], Figure]], about: str, colours: int = COLOURS) -> None:
     """Command line of a module of pictures: write every figure as NAME.png into a folder."""
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help=f"default: {FOLDER}")
+    parser.add_argument("folder", type=Path, nargs="?", default=PICTURES, help="default: that of docs")
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():

@@ -15,7 +15,6 @@ import resource
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -48,12 +47,12 @@ THREADS = (1, 2)
 ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
 
 
-def windows_per_s(weights: Path, height: int, width: int, binning: int | None) -> dict[str, float]:
+def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
     """Windows a second of the network on random events in memory, as precise as `recover`.
 
     `file` takes as many at once as `recover` of a file, `camera` one after the other.
     """
-    recoverer = dolp_recoverer(*load_network(weights), CPU, precision_on(CPU, "auto"), binning=binning)
+    recoverer = dolp_recoverer(*load_network(shipped_weights()), CPU, precision_on(CPU, "auto"), binning=binning)
     rates = {}
     for name, size, runs in (("file", recoverer.at_once(height, width), RUNS), ("camera", 1, TIMED_WINDOWS)):
         count = size * (WARM_RUNS + runs)
@@ -86,13 +85,13 @@ def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
     return list(cutter.add(channels, windows * WINDOW_US))
 
 
-def measure_network(weights: Path, threads: int) -> dict[str, Any]:
+def measure_network(threads: int) -> dict[str, Any]:
     """Windows a second by size of sensor, with and without blocks."""
     config = load(ROOT, [f"runtime.threads={threads}"])
     configure(config.runtime, config.seed)
     kinds = {"pixels": None, "blocks": 2}
     sizes = {
-        f"{height} x {width}": {kind: windows_per_s(weights, height, width, side) for kind, side in kinds.items()}
+        f"{height} x {width}": {kind: windows_per_s(height, width, side) for kind, side in kinds.items()}
         for height, width in SIZES
     }
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
@@ -136,7 +135,6 @@ def main() -> None:
     """Measure, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/robustness.json and emulation.json")
     parser.add_argument("--only", choices=("network", "simulation"))
-    parser.add_argument("--weights", type=Path, default=shipped_weights(), help="checkpoint; default: the shipped one")
     parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
@@ -148,7 +146,7 @@ def main() -> None:
         if arguments.only in (None, kind):
             record = machine_record()
             network = kind == "network"
-            figures = measure_network(arguments.weights, arguments.threads) if network else measure_models()
+            figures = measure_network(arguments.threads) if network else measure_models()
             print(json.dumps(figures, indent=1), flush=True)
             if arguments.write:
                 write_section(name, section, figures, record)
