@@ -15,10 +15,7 @@ def main(config: Config) -> None:
         print("recordings.enabled is false")
         return
     root = input_folder("recordings.root", config.recordings.root)
-    try:
-        names = import_targets(root, out, config.recordings)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
+    names = import_targets(root, out, config.recordings)
     print(f"{len(names)} targets: {', '.join(names)}")
 
 

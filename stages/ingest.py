@@ -11,10 +11,7 @@ def main(config: Config) -> None:
     """Fill data/images and print a summary of its content."""
     if config.ingest.source != "builtin":
         input_folder("ingest.root", config.ingest.root)
-    try:
-        manifest = ingest(config.ingest, config.seed, Path(config.paths.images), config.mapper("ingest"))
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
+    manifest = ingest(config.ingest, config.seed, Path(config.paths.images), config.mapper("ingest"))
     print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in manifest.counts.items()))
 
 

@@ -82,11 +82,6 @@ def angle_image(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8
     return polarization_hsv(torch.ones_like(dolp), dolp, aolp)
 
 
-def paper_map(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The map of the paper's Fig. 3: hue is AoLP (radians), saturation 1, value DoLP."""
-    return polarization_hsv(dolp, torch.ones_like(dolp), aolp)
-
-
 def png(figure: Figure) -> bytes:
     """Encode a figure as a PNG without a date or software name: the same figure gives the same bytes."""
     buffer = io.BytesIO()

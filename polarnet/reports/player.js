@@ -1,7 +1,7 @@
 // Plays the films of a page: colours the grey strips, shares time, zoom and cursor among pictures.
 "use strict";
 
-const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP", paper: "AoLP and DoLP (Fig. 3)" };
+const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP" };
 const FRAMES_PER_SECOND = 6;
 const FULL_ERROR = 0.5; // DoLP at the end of the colours
 
@@ -29,7 +29,6 @@ async function decoded(map, width) {
 }
 
 function printed(kind, value, scale) {
-  if (kind === "paper") return `${printed("dolp", value & 255)} at ${printed("aolp", value >> 8)}`;
   if (kind === "events") return ((value - 128) / 127 * scale).toFixed(0);
   if (kind === "aolp") return `${(value / 256 * 180).toFixed(0)}°`;
   return (value / 255 * (kind === "error" ? FULL_ERROR : 1)).toFixed(2);
@@ -80,12 +79,8 @@ class Player {
       ...map, kind: "error",
       values: map.values.map((value, i) => Math.abs(value - truth.values[i]) / FULL_ERROR),
     }));
-    const papers = maps.filter((map) => map.kind === "dolp").flatMap((map) => {
-      const angle = maps.find((other) => other.kind === "aolp" && other.source === map.source);
-      return angle ? [{ ...map, kind: "paper", values: Uint16Array.from(map.values, (value, i) => 256 * angle.values[i] + value) }] : [];
-    });
-    this.maps = [...maps, ...errors, ...papers];
-    const of_methods = ["dolp", "aolp", "error", "paper"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
+    this.maps = [...maps, ...errors];
+    const of_methods = ["dolp", "aolp", "error"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
     const before = this.kinds?.[this.find("quantity").value];
     this.kinds = of_methods;
     option(this.find("quantity"), of_methods.map((kind) => TITLES[kind]), Math.max(0, of_methods.indexOf(before)));
@@ -103,7 +98,7 @@ class Player {
   arrange() {
     const quantity = this.kinds[this.find("quantity").value];
     const scene = this.scene;
-    this.shown = this.maps.filter((map) => ["events", "s0", quantity].includes(map.kind) || (map.source === "truth" && map.kind !== "paper"));
+    this.shown = this.maps.filter((map) => ["events", "s0", quantity].includes(map.kind) || map.source === "truth");
     const titled = (map) => map.kind === "events" ? "Events" : map.source === "truth" ? `True ${TITLES[map.kind]}` : map.source;
     this.panes = this.shown.map((map) => {
       const figure = document.createElement("figure");
@@ -113,7 +108,7 @@ class Player {
       const canvas = document.createElement("canvas");
       Object.assign(canvas, { width: scene.width, height: scene.height });
       canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", `${titled(map)}${["error", "paper"].includes(map.kind) ? `: ${TITLES[map.kind]}` : ""}, scene ${scene.name}`);
+      canvas.setAttribute("aria-label", `${titled(map)}${map.kind === "error" ? `: ${TITLES[map.kind]}` : ""}, scene ${scene.name}`);
       pane.className = "pane";
       pane.append(canvas);
       caption.append(titled(map), value);
@@ -129,28 +124,26 @@ class Player {
   legends() {
     const ends = {
       events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", "1"], error: ["error 0", `${FULL_ERROR}`],
-      aolp: ["AoLP 0° (to the right)", "180°"], paper: ["brightness: DoLP; hue: AoLP 0° (to the right)", "180°"],
+      aolp: ["AoLP 0° (to the right)", "180°"],
     };
     const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => ends[kind]);
     this.find("legend").replaceChildren(...kinds.map((kind) => {
       const entry = document.createElement("span"), bar = document.createElement("canvas");
       Object.assign(bar, { width: 128, height: 1, className: "bar" });
       bar.setAttribute("aria-hidden", "true");
-      this.paint(bar, kind, Uint16Array.from({ length: 128 }, (_, i) => kind === "paper" ? 512 * i + 255 : 2 * i + 1), 0);
+      this.paint(bar, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
       entry.append(ends[kind][0], bar, ends[kind][1]);
       return entry;
     }));
   }
 
-  /** Colour one byte a pixel, or two for the paper's map: AoLP is the hue, and DoLP scales the colour (V = DoLP). */
+  /** Colour one byte a pixel. */
   paint(canvas, kind, values, frame) {
     const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
     const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3;
     for (let i = 0; i < size; i++) {
-      const value = values[frame * size + i];
-      const entry = 3 * Math.min(top - 1, Math.floor((kind === "paper" ? value >> 8 : value) / 256 * top));
-      const bright = kind === "paper" ? (value & 255) / 255 : 1;
-      for (const k of [0, 1, 2]) image.data[4 * i + k] = bright * table[entry + k];
+      const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / 256 * top));
+      for (const k of [0, 1, 2]) image.data[4 * i + k] = table[entry + k];
       image.data[4 * i + 3] = 255;
     }
     context.putImageData(image, 0, 0);

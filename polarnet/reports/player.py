@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, paper_map, table_of
+from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
 from polarnet.runtime.files import replaced
 from polarnet.storage.panels import NO_EVENTS, Panel
 
@@ -38,7 +38,6 @@ COLOURS = {
     "dolp": DOLP_TABLE,
     "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
     "error": table_of(matplotlib.colormaps["magma"]),
-    "paper": paper_map(torch.ones(1, 256), torch.arange(256)[None] * (torch.pi / 256))[0],  # scaled with DoLP
 }
 
 

@@ -80,23 +80,6 @@ def test_the_error_of_a_constant_tenth_less_is_read_at_the_cursor(browser, files
         assert "True DoLP" in page.inner_text("[data-role=values]")
 
 
-def test_the_player_shows_the_papers_map_of_aolp_and_dolp(browser, files):
-    """Fig. 3 has hue AoLP, saturation 1 and value DoLP: the darkest channel is 0 and the brightest is DoLP."""
-    with opened(browser, files["report"], 1400, "light") as (page, _):
-        page.select_option("[data-role=quantity]", label="AoLP and DoLP (Fig. 3)")
-        page.locator("[data-role=panes]").focus()
-        page.keyboard.press("ArrowDown")
-        dolp, pixel = page.evaluate("""() => {
-          const figures = [...document.querySelectorAll('.panes figure')].filter((one) => one.innerText.includes('°'));
-          const pane = figures.find((one) => !one.innerText.startsWith('True')), canvas = pane.querySelector('canvas');
-          const context = canvas.getContext('2d'), [x, y] = [canvas.width >> 1, (canvas.height >> 1) + 1];
-          const dolp = parseFloat(pane.querySelector('span').textContent);
-          return [dolp, [...context.getImageData(x, y, 1, 1).data]];
-        }""")
-        assert min(pixel[:3]) == 0
-        assert max(pixel[:3]) / 255 == pytest.approx(dolp, abs=0.01)
-
-
 def test_zoom_is_shared_by_all_pictures_and_a_button_beside_a_scene_opens_it_in_the_player(browser, files):
     with opened(browser, files["report"], 1400, "light") as (page, _):
         assert page.locator(".chart svg").count() == 1

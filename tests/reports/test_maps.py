@@ -11,7 +11,6 @@ from polarnet.reports.maps import (
     event_full_scale,
     event_image,
     intensity_image,
-    paper_map,
     polarization_hsv,
 )
 
@@ -27,12 +26,11 @@ def test_fully_polarized_light_shows_its_angle_as_hue(aolp_deg, colour):
     assert tuple(polarization_hsv(pixel(1), pixel(1), pixel(math.radians(aolp_deg)))[0, 0]) == colour
 
 
-def test_the_papers_map_has_the_angle_as_hue_and_dolp_as_value():
+def test_the_papers_map_with_dolp_as_value_and_light_without_polarization():
     assert tuple(polarization_hsv(pixel(1), pixel(0), pixel(1.0))[0, 0]) == (255, 255, 255)
     assert tuple(polarization_hsv(pixel(0.2), pixel(0), pixel(1.0))[0, 0]) == (51, 51, 51)
-    assert tuple(paper_map(pixel(1), pixel(math.radians(60)))[0, 0]) == GREEN
-    assert tuple(paper_map(pixel(0.2), pixel(0))[0, 0]) == (51, 0, 0)
-    assert tuple(paper_map(pixel(0), pixel(1.0))[0, 0]) == (0, 0, 0)
+    assert tuple(polarization_hsv(pixel(1), pixel(1), pixel(math.radians(60)))[0, 0]) == GREEN
+    assert tuple(polarization_hsv(pixel(0.2), pixel(1), pixel(0))[0, 0]) == (51, 0, 0)
 
 
 def test_on_is_red_off_is_blue_and_no_event_is_white():
