@@ -28,8 +28,7 @@ from polarnet.recordings.truth import read_truth
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import scene_from_polarization
 from polarnet.simulation.sequence import simulate
-from studies.e2p_writer import WHITE, mosaicked, write_e2p
-from studies.recording_files import EXPOSURE_US, write_aedat2
+from studies.recording_files import EXPOSURE_US, WHITE, mosaicked, write_aedat2, write_e2p
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 MOSAIC_TEXT = "90 45 / 135 0"
