@@ -73,7 +73,10 @@ def cpu_s() -> float:
 
 def shortest_cpu_s(run: Callable[[], object]) -> float:
     """CPU seconds of the fastest of three runs."""
-    marks = [cpu_s(), *((run(), cpu_s())[1] for _ in range(REPEATS))]
+    marks = [cpu_s()]
+    for _ in range(REPEATS):
+        run()
+        marks.append(cpu_s())
     return float(np.diff(marks).min())
 
 

@@ -24,7 +24,7 @@ from polarnet.runtime.machine import generator_for
 from polarnet.simulation.sets import make_folder_set
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from studies.e2p_writer import WHITE, mosaicked, write_e2p
+from studies.recording_files import WHITE, mosaicked, write_e2p
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
 

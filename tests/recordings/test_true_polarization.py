@@ -14,7 +14,7 @@ from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
 
 pytest.importorskip("h5py")
 
-from studies.e2p_writer import mosaicked, write_e2p
+from studies.recording_files import mosaicked, write_e2p
 
 MOSAIC = parse_mosaic("90 45 / 135 0")
 T_US = np.array([1000, 34_000, 67_000])

@@ -78,11 +78,10 @@ def test_a_bag_of_several_topics_needs_the_topic(rosbags, tmp_path):
     with pytest.raises(RecordingError, match=r"say which topic of events to read, --part with one of /left, /right"):
         read_recording(path)
     assert len(read_recording(path, part="/right").events) == 3
-    path.unlink()
     with pytest.raises(
         RecordingError, match=r"expected a topic of EventArray .* got only /e \(other_msgs/msg/EventArray\)"
     ):
-        read_recording(write(tmp_path / "e.bag", ("/e",), package="other_msgs"))
+        read_recording(write(tmp_path / "e", ("/e",), "ros2", "other_msgs"))
 
 
 def test_a_damaged_bag_is_refused(rosbags, tmp_path):
