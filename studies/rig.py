@@ -1,7 +1,7 @@
 """Accuracy of the calibration of a simulated rig: python -m studies.rig [--write] [--targets N]
 
 Each target is another picture. Its eight captures are written as CeleX-5 files with random delays, sensor noise and hot
-pixels, then imported and calibrated as in the stages. The study prints errors of the start times from the landmark (in
+pixels, then calibrated as in the stage. The study prints errors of the start times from the landmark (in
 camera frames) and refined (in ms, without the part common to all captures: the zero of their clock is a convention),
 and the RMS difference between the DoLP and the scene's own. `--write` puts them into docs/results/recordings.json, what
 `polarnet inspect` says of a capture into docs/results/inspection.json, and draws the pictures of the recordings' pages.
@@ -20,7 +20,7 @@ import torch
 from skimage import data
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig, read_event_capture
-from polarnet.captures.targets import Calibrated, calibrate_targets, import_targets
+from polarnet.captures.targets import Calibrated, calibrate_targets
 from polarnet.config.tree import load
 from polarnet.events.stream import slice_time
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -67,12 +67,11 @@ def measured(
     """Errors of each target; one at a time on disk."""
     for k in range(count):
         name = f"target-{k:02d}"
-        raw, imported, out = folder / "raw", folder / "imported", folder / name
+        raw, out = folder / "raw", folder / name
         truth = write_rig(raw / name, scene_of(k), RIG, recordings, emulator, seed=1, threads=2)
-        import_targets(raw, imported, recordings)
-        (found,) = calibrate_targets(imported, out, recordings, {})
+        (found,) = calibrate_targets(raw, out, recordings, {})
         yield errors_of(name, truth, found, recordings, out)
-        for left in (raw, imported, out):
+        for left in (raw, out):
             shutil.rmtree(left)
 
 
@@ -97,8 +96,7 @@ def draw_documentation(scratch: Path, recordings: RecordingsConfig, emulator: Em
     """The pictures of the pages on recordings, and what `polarnet inspect` says, of one target."""
     name = "coffee"
     truth = write_rig(scratch / "raw" / name, scene_of(0), RIG, recordings, emulator, seed=1, threads=2)
-    import_targets(scratch / "raw", scratch / "imported", recordings)
-    (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
+    (found,) = calibrate_targets(scratch / "raw", scratch / "calibrated", recordings, {})
     draw_calibration(found, recordings, PICTURES / "recordings_calibration.png")
     first = EVENT_CAPTURES[0]
     events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)

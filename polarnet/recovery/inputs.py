@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.targets import calibrate_targets, import_targets
+from polarnet.captures.targets import calibrate_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
 from polarnet.events.streaming import WindowRule
@@ -20,13 +20,13 @@ from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, o
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
-from polarnet.recordings.recording import detect_format, open_recording
+from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.storage.events import EventStore
-from polarnet.storage.parts import unknown_sequence
+from polarnet.storage.parts import METADATA, unknown_sequence
 
 STANDARD_INPUT = "-"
 STEPS_PER_BLOCK = 64  # steps of the store's index, 2**14 events each
@@ -145,7 +145,7 @@ def _channels(files: Files, work: Path) -> Channels:
         return _captured(path, work, files.captures)
     if path.is_dir() and (exported := _exported(path, files.sequence)):
         return open_four(exported, dict.fromkeys(exported, 0), files.open)  # times count from the sequence's start
-    if detect_format(path) == "store":
+    if (path / METADATA).is_file():
         store = EventStore.open(path)
         return _stored(store, _named(files.sequence, store.sequences, path.name))
     if files.plain:
@@ -202,8 +202,7 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Chan
     root.mkdir(parents=True)
     target = root / folder.resolve().name
     target.symlink_to(folder.resolve(), target_is_directory=True)
-    import_targets(root, work / "imported", config)
-    calibrate_targets(work / "imported", work / "calibrated", config, {})
+    calibrate_targets(root, work / "calibrated", config, {})
     return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 

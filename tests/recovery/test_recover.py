@@ -153,20 +153,15 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
 
 
 def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channels, project_root, tmp_path, monkeypatch):
-    """Import and calibration are replaced by a copy of the one file of each folder, its number of events."""
+    """The calibration is replaced by a copy of the one file of each folder, its number of events."""
 
-    def imported(root, out, config):
+    def calibrated(root, out, config, about):
         (one,) = root.iterdir()
-        out.mkdir(exist_ok=True)
-        (out / "count").write_text((one / "events_0.bin").read_text())
-
-    def calibrated(imported, out, config, about):
-        count = int((imported / "count").read_text())
+        count = int((one / "events_0.bin").read_text())
         writer = EventStore.create(out / "events.zarr", ["target"], HEIGHT, WIDTH, {})
         writer.write("target", [slice_count(channel, 0, count) for channel in channels], DURATION_US)
         writer.finish()
 
-    monkeypatch.setattr(inputs, "import_targets", imported)
     monkeypatch.setattr(inputs, "calibrate_targets", calibrated)
     config = load(project_root).recordings
     for parent, count in (("first", 10), ("second", 20), ("first", 10)):

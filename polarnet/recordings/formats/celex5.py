@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, sensor_size, start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
@@ -55,7 +55,7 @@ class Picture(NamedTuple):
     """A full picture."""
 
     t_us: int | None
-    """The computer's time on arrival, to the millisecond; None in files without it."""
+    """The computer's time on arrival, the middle of its millisecond; None in files without it."""
     intensity: UInt16[np.ndarray, "h w"]
     """800 x 1280 pixels from a BIN file; 0 to 4095; brighter is larger."""
 
@@ -89,7 +89,6 @@ def open_bin(path: Path, choices: Choices) -> Source:
             f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
             f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
         )
-    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
     clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
     def blocks(counts: Counts) -> Iterator[Block]:
@@ -107,7 +106,7 @@ def open_bin(path: Path, choices: Choices) -> Source:
                 t, x, y, p = (column[:events] for column in columns)
                 yield Block(microseconds(t, clock_mhz), x, y, p)
 
-    return Source(height, width, blocks)
+    return Source(HEIGHT, WIDTH, blocks)
 
 
 def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
@@ -125,7 +124,7 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
                     f"{path.name}: expected {PICTURE_BYTES} bytes of a full picture, got {len(package)}; "
                     f"the file is damaged"
                 )
-            yield Picture(None if t_ms is None else 1000 * t_ms, _unpacked(package[:-1]))
+            yield Picture(None if t_ms is None else 1000 * t_ms + 500, _unpacked(package[:-1]))
 
 
 def matches_csv(path: Path, head: bytes) -> bool:
@@ -148,7 +147,6 @@ def open_csv(path: Path, choices: Choices) -> Source:
             f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
             f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
         )
-    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
 
     def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
@@ -157,7 +155,7 @@ def open_csv(path: Path, choices: Choices) -> Source:
             counts["no_change"] += len(rows) - len(t)
             yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
 
-    return Source(height, width, blocks)
+    return Source(HEIGHT, WIDTH, blocks)
 
 
 def _unpacked(data: np.ndarray) -> np.ndarray:

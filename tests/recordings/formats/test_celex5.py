@@ -62,15 +62,25 @@ def test_polarity_is_the_sign_of_the_change_and_the_first_compares_with_zero(tmp
 def test_pictures_read_back_equal_but_for_the_pixel_that_holds_the_mode(tmp_path):
     generator = np.random.default_rng(0)
     pictures = [generator.integers(0, 4096, (800, 1280)).astype(np.uint16) for _ in range(2)]
-    write_celex5_pictures(tmp_path / "p.bin", pictures, [1_000_000, 1_033_000])
+    write_celex5_pictures(tmp_path / "p.bin", pictures, [1_000_500, 1_033_500])
     read = list(celex5_pictures(tmp_path / "p.bin"))
-    assert [picture.t_us for picture in read] == [1_000_000, 1_033_000]
+    assert [picture.t_us for picture in read] == [1_000_500, 1_033_500]
     for before, after in zip(pictures, read, strict=True):
         assert np.flatnonzero(before != after.intensity).tolist() in ([], [0])
     assert len(read_recording(tmp_path / "p.bin").events) == 0
     (tmp_path / "p.bin").write_bytes(header(loop_a=3) + package(bytes(300), last=0))
     with pytest.raises(RecordingError, match="expected 1536001 bytes of a full picture, got 301"):
         list(celex5_pictures(tmp_path / "p.bin"))
+
+
+def test_the_end_of_a_bin_file_that_is_cut_is_left_out(tmp_path, make_random_events):
+    path = tmp_path / "e.bin"
+    written = write_celex5_bin(path, make_random_events(6, 60_000, 1_000_000))
+    path.write_bytes(path.read_bytes()[:-100])  # of the second of two packages
+    recording = read_recording(path)
+    assert recording.repairs["cut_tail"] == 1
+    assert recording.events.t.tolist() == written.t[: len(recording.events)].tolist()
+    assert 0 < len(recording.events) < len(written)
 
 
 def test_imu_samples_after_a_package_are_passed_over(tmp_path, make_events, read):
