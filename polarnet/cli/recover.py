@@ -9,6 +9,7 @@ from polarnet.cli.commands import BESIDE
 from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, reading_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root
+from polarnet.cli.stores import is_store
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import Config, load
 from polarnet.events.rotation import Rotation
@@ -16,7 +17,7 @@ from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
-from polarnet.recordings.recording import detect_format, is_recording, open_recording
+from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
@@ -115,7 +116,7 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
     if options.truth is None:
         return None
     path = options.input[0]
-    if options.size or detect_format(Path(path)) != "store":
+    if options.size or not is_store(path):
         raise ValueError("--truth: expected an event store in its own size; leave out --truth or --size")
     truth = truth_beside(path) if options.truth == BESIDE else options.truth
     if truth is None:

@@ -12,19 +12,21 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import MAX_SIDE, Events
-from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag, store
+from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import (
     GZIP,
     REPAIRS,
     ZIP,
     Block,
+    Blocks,
     CameraFrames,
     Choices,
     Counts,
     RecordingError,
     Source,
     joined,
+    sensor_size,
     start_of,
 )
 
@@ -53,7 +55,6 @@ def signature(start: bytes) -> Callable[[Path, bytes], bool]:
 
 PART, CLOCK = ("part",), ("clock_mhz",)
 FORMATS = {
-    "store": Format("our own event store", store.matches, store.open_store, takes=PART),
     **{
         name: Format(
             f"HDF5 of {layout.owner}",
@@ -82,8 +83,6 @@ FORMATS = {
     "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin, takes=CLOCK),
 }
 """Ordered as they are tried on a file of unknown format."""
-FOLDERS = ("store", "rosbag")
-"""Formats whose recordings may be folders."""
 PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_csv", "celex5_bin")
 """Formats that are read from gzip and zip archives too."""
 
@@ -105,13 +104,12 @@ class RecordingReader:
     damaged. `repairs` counts the repairs up to the latest chunk.
     """
 
-    def __init__(self, path: Path, form: str, source: Source, chunk_events: int):
+    def __init__(self, path: Path, form: str, blocks: Blocks, sensor: tuple[int, int], chunk_events: int):
         self.path = path
         self.format = form
-        self.height = source.height
-        self.width = source.width
+        self.height, self.width = sensor
         self.repairs = Counts()
-        self._source = source
+        self._blocks = blocks
         self._chunk_events = chunk_events
 
     def __iter__(self) -> Iterator[Events]:
@@ -124,7 +122,8 @@ class RecordingReader:
         """
         self.repairs.clear()
         self.repairs.share_read = 0.0
-        for block in _cut(repaired(self.path.name, self._source, self.repairs, bridged_us), size):
+        sensor = self.height, self.width
+        for block in _cut(repaired(self.path.name, self._blocks, sensor, self.repairs, bridged_us), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)
 
@@ -142,8 +141,8 @@ def open_recording(
     """Open a file to read it chunk by chunk.
 
     `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
-    not state them. `part` is one of several recordings in a file: SEQUENCE/ANGLE of an event store, a topic of a bag, a
-    stream of AEDAT, `left` or `right` of M3ED and MVSEC. `clock_mhz` is the clock of a CeleX-5 whose file holds clock
+    not state them. `part` is one of several recordings in a file: a topic of a bag, a stream of AEDAT, `left` or
+    `right` of M3ED and MVSEC. `clock_mhz` is the clock of a CeleX-5 whose file holds clock
     ticks. RecordingError where the format is unknown, has no parts or the content cannot be events; RuntimeError naming
     the package to install where an optional one is missing.
     """
@@ -168,7 +167,9 @@ def open_recording(
             )
     if form not in PACKABLE and path.is_file() and _packed(path):
         raise RecordingError(f"{path.name}: expected the format {form} outside an archive; unpack it")
-    return RecordingReader(path, form, FORMATS[form].open(path, choices), chunk_events)
+    source = FORMATS[form].open(path, choices)
+    sensor = sensor_size(path, choices, source.height, source.width)
+    return RecordingReader(path, form, source.blocks, sensor, chunk_events)
 
 
 def read_recording(
@@ -226,7 +227,7 @@ def detect_format(path: str | os.PathLike[str]) -> str:
         if not head:
             raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
-        if (name in FOLDERS or head) and form.matches(path, head):
+        if (name == "rosbag" or head) and form.matches(path, head):  # a bag may be a folder
             return name
     raise RecordingError(
         f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"

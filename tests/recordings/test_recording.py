@@ -88,7 +88,7 @@ def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, r
         (b"", "the file is empty"),
         (
             b"\x00\x01\x02\xff" * 100,
-            "of none of the formats store, e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag",
+            "of none of the formats e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag",
         ),
         (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
         (b"1,2,3,4,5,6\n", "of none of the formats"),
@@ -103,7 +103,7 @@ def test_content_of_no_known_format_is_refused_by_name(tmp_path, content, messag
 def test_a_format_that_is_named_is_taken_without_a_look_at_the_content(tmp_path):
     (tmp_path / "e.csv").write_text("10,20,4000,1\n11,21,4001,0\n")
     assert open_recording(tmp_path / "e.csv", "text", height=4002, width=40).format == "text"
-    with pytest.raises(ValueError, match=r"expected a format of store, .*, got 'celex'"):
+    with pytest.raises(ValueError, match=r"expected a format of e2p, .*, got 'celex'"):
         read_recording(tmp_path / "e.csv", "celex")
 
 
@@ -157,7 +157,7 @@ def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, ma
     events = replace(events, height=800, width=1280) if kind == "celex5_csv" else events
     events = replace(events, t=events.t - events.t[0]) if kind == "event_stream" else events  # as faery writes them
     write(tmp_path / f"e{suffix}", events)
-    part = {"store": "135", "m3ed": "left", "mvsec": "left"}.get(kind)
+    part = {"m3ed": "left", "mvsec": "left"}.get(kind)
     recording = read_recording(tmp_path / f"e{suffix}", part=part)
     assert (kind.split()[0].rstrip(","), recording.repairs) == (recording.format, {})
     assert same_events(recording.events, events)
