@@ -32,7 +32,7 @@ NO_MODE = 255
 CSV_LINES = 2**18  # written at a time
 
 
-def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_MHZ) -> Events:
+def write_celex5_bin(path: Path, events: Events) -> Events:
     """Write events as the sensor sends them, and return the events that a reader gets from the file.
 
     Each time becomes the sensor's first time stamp at or after it (every 10.24 us at 100 MHz), from 0 on. Polarity is a
@@ -44,7 +44,7 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     validate(events)
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
-    stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
+    stamp = -(-events.t.numpy() * CLOCK_MHZ // TICK_CYCLES)
     row, column = events.y.numpy().astype(np.int64), events.x.numpy().astype(np.int64)
     p = events.p.numpy()
     first_is_darker = np.zeros(len(p), np.bool_)
@@ -56,7 +56,7 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     items = _items(stamp, row, column, _intensities(row * WIDTH + column, p))
     _write_packages(path, _packed(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)))
     return Events(
-        torch.from_numpy(microseconds(stamp, clock_mhz)),
+        torch.from_numpy(microseconds(stamp)),
         torch.from_numpy(column.astype(np.int16)),
         torch.from_numpy(row.astype(np.int16)),
         torch.from_numpy(p.copy()),

@@ -185,7 +185,7 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors is not there"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
-    (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
+    (("--live", "--method", "cf", "--height", 70), "--live: expected no --height"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
     (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
