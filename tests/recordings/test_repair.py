@@ -160,11 +160,6 @@ def test_the_largest_step_back_that_is_repaired_is_ten_milliseconds():
     assert read([at([20_000, 20_000 - LATE_US - 1, *later])])[1] == {"time_glitches": 1}
 
 
-def test_pauses_are_kept_and_counted():
-    rows, counts = read([at([0, 1, 3_000_000, 3_000_001, 9_000_000])])
-    assert (times_of(rows), counts) == ([0, 1, 3_000_000, 3_000_001, 9_000_000], {"pauses": 2})
-
-
 def test_blocks_of_any_length_give_the_same_events():
     generator = np.random.default_rng(3)
     times = np.cumsum(generator.integers(0, 50, 2000)) + generator.integers(-5000, 5000, 2000)
