@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -53,8 +52,9 @@ def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clea
     """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, a folder
-    that `polarnet export` wrote, or a folder of division-of-time captures, which are calibrated in `work`. `clean`
-    removes noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
+    that `polarnet convert` wrote, or a folder of division-of-time captures, which are calibrated in `work`, a folder
+    without other targets. `clean` removes noise before the size is reduced. A ValueError or FileNotFoundError says what
+    is missing.
     """
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
@@ -170,7 +170,7 @@ def _stored(store: EventStore, sequence: str) -> Channels:
 
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet export` or `polarnet simulate` wrote; empty for any other folder."""
+    """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
     if (folder / EXPORT_INDEX).is_file():
         names = sorted(path.name for path in folder.iterdir() if path.is_dir())
         folder = folder / _named(sequence, names, folder.name)
@@ -198,7 +198,6 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Chan
     if config is None:
         raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
     root = work / "targets"
-    shutil.rmtree(root, ignore_errors=True)  # of a run on another folder, maybe of the same name
     root.mkdir(parents=True)
     target = root / folder.resolve().name
     target.symlink_to(folder.resolve(), target_is_directory=True)

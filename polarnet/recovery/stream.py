@@ -203,9 +203,6 @@ def _too_short(source: Input, rule: WindowRule, duration_us: int) -> str:
     )
     if source.live or duration_us < SHORTEST_STEP_US:
         return lasts
-    if duration_us >= TRAINED_WINDOW_US:
-        return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
-    return (
-        f"{lasts}. Networks need windows of {TRAINED_WINDOW_US / 1000:g} ms, filters do not: "
-        f"--method highpass --window {duration_us}us"
-    )
+    if duration_us < TRAINED_WINDOW_US:
+        return f"{lasts}, or give a filter, --method highpass --window {duration_us}us"
+    return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
