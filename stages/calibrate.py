@@ -1,10 +1,10 @@
-"""data/imported -> data/calibrated: real targets on one clock, in the same stores as simulated sequences."""
+"""data/recordings -> data/calibrated: real targets on one clock, in the same stores as simulated sequences."""
 
 import dataclasses
 from pathlib import Path
 
 from polarnet.captures.targets import calibrate_targets, start_over
-from polarnet.config.tree import Config, hydra_stage
+from polarnet.config.tree import Config, hydra_stage, input_folder
 from polarnet.reports.recordings import draw_calibration, draw_sequence
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -19,7 +19,11 @@ def main(config: Config) -> None:
         print("recordings.enabled is false")
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}
-    targets = calibrate_targets(Path(config.paths.imported), out, config.recordings, about)
+    root = input_folder("recordings.root", config.recordings.root)
+    try:
+        targets = calibrate_targets(root, out, config.recordings, about)
+    except ValueError as error:
+        raise SystemExit(str(error)) from None
     events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
     for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")

@@ -15,7 +15,6 @@ from polarnet.recordings.formats.aedat3 import PACKET
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
-from polarnet.storage.events import EventStore
 from studies.celex5_writer import write_celex5_bin, write_celex5_csv
 from studies.rosbag_writer import array_bytes, write_arrays, write_packets
 
@@ -161,14 +160,6 @@ def with_faery(path: Path, events: Events) -> None:
     faery.events_stream_from_array(rows, (events.width, events.height)).to_file(path)
 
 
-def write_store(path: Path, events: Events) -> None:
-    """An event store; the channels at 0 and 135 degrees hold all events, the others a few and none."""
-    store = EventStore.create(path, ["lake"], events.height, events.width, {})
-    channels = [slice_count(events, 0, count) for count in (len(events), 5, 0, len(events))]
-    store.write("lake", channels, int(events.t[-1]) + 1)
-    store.finish()
-
-
 def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Writer:
     """A writer of a bag with a message for every `PACKET_EVENTS` events."""
 
@@ -182,7 +173,6 @@ def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Wr
 PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
 AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
 FILES: dict[str, tuple[str, Writer]] = {
-    "store": (".zarr", write_store),
     **{name: (".h5", table_writer(name)) for name in LAYOUTS},
     "dsec of polarnet": (".h5", lambda path, events: write_hdf5(path, events, None)),
     "rosbag": (".bag", messages(write_arrays, array_bytes)),

@@ -1,7 +1,7 @@
 """Pictures of the pages on recordings, and what `polarnet inspect` says, from a simulated rig: python -m studies.rig
 
 The eight captures of a photograph are written as CeleX-5 files with random delays, sensor noise and hot pixels, then
-imported and calibrated as in the stages.
+calibrated as in the stage.
 """
 
 import json
@@ -13,7 +13,7 @@ import torch
 from skimage import data
 
 from polarnet.captures.dot import EVENT_CAPTURES, read_event_capture
-from polarnet.captures.targets import calibrate_targets, import_targets
+from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import load
 from polarnet.events.stream import slice_time
 from polarnet.recordings.arrangements import shifted
@@ -50,8 +50,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         write_rig(scratch / "raw" / name, scene, RIG, recordings, emulator, seed=1, threads=2)
-        import_targets(scratch / "raw", scratch / "imported", recordings)
-        (found,) = calibrate_targets(scratch / "imported", scratch / "calibrated", recordings, {})
+        (found,) = calibrate_targets(scratch / "raw", scratch / "calibrated", recordings, {})
         draw_calibration(found, recordings, PICTURES / "recordings_calibration.png")
         first = EVENT_CAPTURES[0]
         events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)

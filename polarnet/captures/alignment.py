@@ -200,42 +200,33 @@ def redundancy_shifts(
     The shifts come from linearised least squares (Gauss-Newton) and have mean 0. Shifts that the scene does not
     determine, because all four captures see the same, stay near 0.
     """
-    stacks = [_Stack(capture, start, config) for capture, start in zip(captures, start_us.tolist(), strict=True)]
-    first, last = max(stack.t_us[0] for stack in stacks), min(stack.t_us[-1] for stack in stacks)
+    from scipy.interpolate import make_interp_spline  # half a second, which every stage would pay
+
+    lines = []
+    for capture, start in zip(captures, start_us.tolist(), strict=True):
+        chosen = _pictures_after(capture, start)
+        pictures = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
+        lines.append(make_interp_spline(capture.t_us[chosen] - start, pictures, k=1))
+    slopes_of = [line.derivative() for line in lines]
+    first, last = max(line.t[0] for line in lines), min(line.t[-1] for line in lines)
     margin = 1000 * config.refine_within_ms / 2
-    count = int((last - first - 2 * margin) / stacks[0].period_us)
+    count = int((last - first - 2 * margin) / np.median(np.diff(lines[0].t[1:-1])))
     if count < 2:
         raise RecordingError("the intensity captures have too few pictures in common after the landmark to align them")
     t_us = np.linspace(first + margin, last - margin, count)
     shifts = np.zeros(4)
     for _ in range(ITERATIONS):
-        values = [stack.at(t_us + shift) for stack, shift in zip(stacks, shifts.tolist(), strict=True)]
-        slopes = np.stack([s * v[1].reshape(-1) for s, v in zip(POLARIZER_SIGNS, values, strict=True)], axis=1)
-        left = sum(s * v[0].reshape(-1) for s, v in zip(POLARIZER_SIGNS, values, strict=True))
+        values, rates = (
+            np.stack([line(t_us + shift).ravel() for line, shift in zip(some, shifts.tolist(), strict=True)], axis=1)
+            for some in (lines, slopes_of)
+        )
+        slopes, left = rates * POLARIZER_SIGNS, values @ POLARIZER_SIGNS
         weight = REDUNDANCY_SHARE / max(float(np.mean(left**2)), 1e-12)
         prior = np.eye(4) / LANDMARK_ERROR_US**2
         shifts = np.linalg.solve(weight * slopes.T @ slopes + prior, weight * slopes.T @ (slopes @ shifts - left))
         shifts -= shifts.mean()
-    level = np.sqrt(np.mean(sum(v[0] for v in values) ** 2)) / 4
+    level = np.sqrt(np.mean(values.mean(axis=1) ** 2))
     return shifts, float(np.sqrt(np.mean(left**2)) / level)
-
-
-class _Stack:
-    """Reduced pictures of a capture from its start on, interpolated to any time of the common clock."""
-
-    def __init__(self, capture: IntensityCapture, start_us: float, config: RecordingsConfig):
-        chosen = _pictures_after(capture, start_us)
-        self.t_us = capture.t_us[chosen] - start_us
-        self.period_us = float(np.median(np.diff(self.t_us)))
-        self.frames = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
-
-    def at(self, t_us: Float64[np.ndarray, " n"]) -> tuple[Float32[np.ndarray, "n h w"], Float32[np.ndarray, "n h w"]]:
-        """Pictures and their change per microsecond, by linear interpolation."""
-        k = np.clip(np.searchsorted(self.t_us, t_us, side="right") - 1, 0, len(self.t_us) - 2)
-        step = self.t_us[k + 1] - self.t_us[k]
-        share = np.clip((t_us - self.t_us[k]) / step, 0, 1).astype(np.float32)[:, None, None]
-        difference = self.frames[k + 1] - self.frames[k]
-        return self.frames[k] + share * difference, difference / step.astype(np.float32)[:, None, None]
 
 
 def _pictures_after(capture: IntensityCapture, start_us: float | int) -> slice:

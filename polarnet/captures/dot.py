@@ -27,8 +27,6 @@ INTENSITY_CAPTURES = tuple(f"intensity_{angle}" for angle in POLARIZER_ANGLES_DE
 CAPTURES = (*EVENT_CAPTURES, *INTENSITY_CAPTURES)
 STARTS_FILE = "starts.json"
 STEPS_OF_8_BITS = 16.0  # 12-bit steps per level of 8 bits, the scale of the vendor's programs and of `dark_level`
-STAMP_US = 1000  # resolution of the computer's picture times, which are rounded down
-IRREGULAR_US = 3000.0  # larger deviations from a regular clock mean that the pictures were not taken by one
 
 
 @section
@@ -157,11 +155,7 @@ def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCap
         region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
     if len(pictures) < 2:
         raise RecordingError(f"{path.name}: expected at least two full pictures, got {len(pictures)}")
-    stamps_us = np.array(times, np.int64)
-    if bin_file and config.picture_rate_hz is None:
-        t_us = regular_times_us(path.name, stamps_us)
-    else:
-        t_us = check_times(stamps_us.astype(np.float64), path.name) + stamps_us[0]
+    t_us = check_times(np.array(times, np.float64), path.name) + times[0]
     return IntensityCapture(t_us, np.stack(pictures), np.array(region))
 
 
@@ -190,24 +184,6 @@ def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> U
     """The landmark's region: the upper right corner of the part of the sensor in use."""
     height, width = config.region
     return picture[:height, config.sensor[1] - width : config.sensor[1]]
-
-
-def regular_times_us(name: str, stamps_us: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Times of pictures from stamps rounded down to milliseconds, by the best-fitting regular clock.
-
-    Lost pictures leave gaps. If no clock fits, times are mid-millisecond. RecordingError unless stamps increase.
-    """
-    middles = stamps_us + STAMP_US // 2
-    steps = np.diff(stamps_us)
-    if (steps <= 0).any():
-        k = int((steps <= 0).argmax())
-        raise RecordingError(f"{name}: picture {k + 1} is stamped {stamps_us[k + 1]} us, not later than the one before")
-    number = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(steps / np.median(steps))))])
-    period, first = np.polyfit(number, middles - middles[0], 1)
-    fitted = first + period * number
-    if np.abs(fitted - (middles - middles[0])).max() > IRREGULAR_US:
-        return middles
-    return middles[0] + np.rint(fitted).astype(np.int64)
 
 
 def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsConfig) -> int:

@@ -1,4 +1,4 @@
-"""Decode division-of-time captures once, then put them on one clock, in the stores that every later stage reads.
+"""Put division-of-time captures on one clock, in the stores that every later stage reads.
 
 The stores `events.zarr` and `frames.zarr` have the layout of simulated sequences; all targets are in the split `test`.
 """
@@ -33,16 +33,16 @@ from polarnet.events.stream import Events, crop, downscale, slice_time
 from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
-from polarnet.runtime.files import check_seal, seal, sha256
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
 
 STATUS_FILE = "status.json"
 WHITE = 255.0  # maximum of reduced pictures
+MAX_DURATION_S = 600.0  # of a sequence, without `duration_s`
 
 
 class Target(NamedTuple):
-    """The eight captures of one target, as stored by `import_targets`."""
+    """The eight captures of one target, each by its own clock."""
 
     name: str
     events: Mapping[str, Events]
@@ -51,63 +51,15 @@ class Target(NamedTuple):
     """Start times set by hand."""
 
 
-def import_targets(root: Path, out: Path, config: RecordingsConfig) -> list[str]:
-    """Decode every target of `root` into `out` and return the targets' names.
-
-    `out` gets events.zarr, a folder of pictures for each target, and status.json. In events.zarr the four event
-    captures of a target are its channels, each by its own clock from its first event on. RecordingError where a file is
-    missing or damaged.
-    """
-    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    if not names:
-        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
-    start_over(out, enabled=True)
-    captures = {name: find_captures(root / name) for name in names}
-    hashes = {
-        name: {key: sha256(*(sorted(one.iterdir()) if one.is_dir() else [one])) for key, one in captures[name].items()}
-        for name in names
-    }
-    attributes = {"sensor": list(config.sensor), "files": hashes}
-    store = EventStore.create(out / "events.zarr", names, config.sensor[0], config.sensor[1], attributes)
-    for name in names:
-        files, folder = captures[name], out / name
-        channels, origins = [], {}
-        for capture in EVENT_CAPTURES:
-            events = read_event_capture(files[capture], config)
-            origins[capture] = int(events.t[0]) if len(events) else 0
-            channels.append(shifted(events, origins[capture]))
-        store.write(name, channels, max((int(e.t[-1]) for e in channels if len(e)), default=0))
-        folder.mkdir()
-        for capture in INTENSITY_CAPTURES:
-            pictures = read_intensity_capture(files[capture], config)
-            np.save(folder / f"{capture}.npy", pictures.pictures)
-            np.savez(folder / f"{capture}_times.npz", t_us=pictures.t_us, region=pictures.region)
-        content = {"origin_us": origins, "given_us": given_starts(root / name)}
-        (folder / "clocks.json").write_text(json.dumps(content, indent=2) + "\n")
-        seal(folder)
-    store.finish()
-    return names
-
-
-def open_target(imported: Path, name: str) -> Target:
-    """Open an imported target, its events by the clocks of their files; pictures are memory-mapped.
-
-    ValueError if a file has changed since the import.
-    """
-    folder = imported / name
-    check_seal(folder)
-    clocks = json.loads((folder / "clocks.json").read_text())
-    channels = EventStore.open(imported / "events.zarr").read(name)
-    events = {
-        capture: shifted(channel, -clocks["origin_us"][capture])
-        for capture, channel in zip(EVENT_CAPTURES, channels, strict=True)
-    }
-    intensities = {}
-    for capture in INTENSITY_CAPTURES:
-        with np.load(folder / f"{capture}_times.npz") as times:
-            pictures = np.load(folder / f"{capture}.npy", mmap_mode="r")
-            intensities[capture] = IntensityCapture(times["t_us"], pictures, times["region"])
-    return Target(name, events, intensities, clocks["given_us"])
+def read_target(folder: Path, config: RecordingsConfig) -> Target:
+    """The captures in a target's folder; RecordingError where a file is missing or damaged."""
+    files = find_captures(folder)
+    return Target(
+        folder.name,
+        {capture: read_event_capture(files[capture], config) for capture in EVENT_CAPTURES},
+        {capture: read_intensity_capture(files[capture], config) for capture in INTENSITY_CAPTURES},
+        given_starts(folder),
+    )
 
 
 def start_over(out: Path, *, enabled: bool) -> None:
@@ -136,23 +88,25 @@ class Calibrated(NamedTuple):
     duration_us: int
 
 
-def calibrate_targets(
-    imported: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]
-) -> list[Calibrated]:
-    """Put every imported target on one clock and write events.zarr, frames.zarr and calibration.json into `out`.
+def calibrate_targets(root: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]) -> list[Calibrated]:
+    """Put every target of `root` on one clock and write events.zarr, frames.zarr and calibration.json into `out`.
 
-    `about` becomes the stores' attributes.
+    `about` becomes the stores' attributes. RecordingError where a file is missing or damaged, or a start is not found.
     """
-    source = EventStore.open(imported / "events.zarr")
-    names, (height, width) = source.sequences, config.size
+    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    if not names:
+        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
+    for name in names:
+        find_captures(root / name)  # a missing file is reported before hours of decoding
     start_over(out, enabled=True)
-    frames_max = len(frame_times_us(max(source.duration_us(name) for name in names), config))
+    height, width = config.size
+    frames_max = len(frame_times_us(round(1e6 * (config.duration_s or MAX_DURATION_S)), config))
     events = EventStore.create(out / "events.zarr", names, height, width, about)
     contents = Contents(dict.fromkeys(names, "test"), about)
     frames = FrameStore.create(out / "frames.zarr", contents, frames_max, height, width)
     targets = []
     for name in names:
-        target = open_target(imported, name)
+        target = read_target(root / name, config)
         one, clean = calibrate_target(target, config)
         channels, t_us, intensity = aligned(target._replace(events=clean), one, config)
         vectors = stokes.stokes_from_intensities(intensity)

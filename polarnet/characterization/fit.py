@@ -15,7 +15,7 @@ from polarnet.characterization.intervals import (
     intervals_of,
     piled_up_us,
 )
-from polarnet.characterization.light import KnownLight, Source, increments_of, source_of
+from polarnet.characterization.light import FlickerRecording, Source, increments_of, source_of
 from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
 from polarnet.characterization.thresholds import (
     PixelThresholds,
@@ -25,18 +25,16 @@ from polarnet.characterization.thresholds import (
     thresholds_without_leak,
 )
 from polarnet.events.stream import Events
+from polarnet.simulation.pixels.physics import PixelConfig
 
 MAX_LEAK_ERROR = 0.05  # relative; above it shot noise hides the leak, and its error is unreliable
 MIN_PIXELS = 50
-MAX_SPREAD_ERROR = 0.3  # relative, of the leak's spread and jitter
 MAX_SWING = 0.3  # relative swing of the OFF rate under constant light; larger: something moved or flickered
-KNOWN_LIGHT_PARAMETERS = (
+FLICKER_PARAMETERS = (
     "contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma_on", "contrast_threshold_sigma_off",
     "contrast_threshold_correlation", "cutoff_hz",
 )  # fmt: skip
-CONSTANT_LIGHT_PARAMETERS = (
-    "shot_noise_rate_hz", "noise_rate_cov_decades", "leak_jitter", "hot_pixel_share", "hot_pixel_rate_hz",
-)  # fmt: skip
+CONSTANT_LIGHT_PARAMETERS = ("shot_noise_rate_hz", "hot_pixel_share", "hot_pixel_rate_hz")
 
 
 @dataclass
@@ -56,14 +54,15 @@ class SensorFit:
 
 
 def fit_sensor(
-    static: Events | None, static_light: float, known: Sequence[KnownLight], others: Sequence[Events] = ()
+    static: Events | None, static_light: float, flickers: Sequence[FlickerRecording], pixel: PixelConfig
 ) -> SensorFit:
     """Fit a sensor to recordings of one camera.
 
-    `static` was recorded under constant light of `static_light` DN; `known` under known light; `others` under light
-    that is not known. ValueError if nothing was recorded, or if the recordings are of sensors of different sizes.
+    `static` was recorded under constant light of `static_light` DN. `pixel` has the response to light, and the spread
+    and the jitter of the leak. ValueError if nothing was recorded, or if the recordings are of sensors of different
+    sizes.
     """
-    recordings = [*([] if static is None else [static]), *(one.events for one in known), *others]
+    recordings = [*([] if static is None else [static]), *(one.events for one in flickers)]
     sizes = {(one.height, one.width) for one in recordings}
     if len(sizes) != 1:
         raise ValueError(f"expected recordings of one sensor, got sizes {sorted(sizes)} (height, width)")
@@ -71,7 +70,7 @@ def fit_sensor(
     ordered = [by_pixel(one) for one in recordings]
     noise = None
     if static is not None:
-        noise = estimate_noise(ordered[0], hot_under_constant_light(static))
+        noise = estimate_noise(ordered[0], hot_under_constant_light(static), pixel)
         ordered = [chosen_pixels(events, ~noise.hot) for events in ordered]  # hot pixels do not follow the light
         if noise.swing > MAX_SWING:
             fit.notes.append(
@@ -82,15 +81,15 @@ def fit_sensor(
     dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
     reason = "intervals between a pixel's events do not pile up at a minimum, and shot noise is too rare to show it"
     fit.enter("refractory_period_us", dead_time, reason)
-    leak = noise.leak if noise and noise.leak.error <= MAX_LEAK_ERROR * noise.leak.value else None
+    leak = noise.leak if noise else None
+    leak = leak if leak and leak.error <= MAX_LEAK_ERROR * leak.value else None
     reason = "under constant light, shot noise comes before the leak; record brighter"
     fit.enter("leak_rate_hz", leak, "needs a static recording" if noise is None else reason)
-    shortest_us, first = dead_time.value if dead_time else 0.0, 0 if static is None else 1
-    sources = [source_of(one, events, shortest_us) for one, events in zip(known, ordered[first:], strict=False)]
-    deviations = _fit_known(fit, sources, leak.value if leak else 0.0) if sources else (0.0, 0.0)
+    shortest_us, flickering = dead_time.value if dead_time else 0.0, ordered[len(ordered) - len(flickers) :]
+    sources = [source_of(one, events, pixel, shortest_us) for one, events in zip(flickers, flickering, strict=True)]
+    deviations = _fit_flicker(fit, sources, leak.value if leak else 0.0) if sources else (0.0, 0.0)
     if not sources:
-        reason = "needs a moving recording with frames, or a flicker recording"
-        fit.missing |= dict.fromkeys(KNOWN_LIGHT_PARAMETERS, reason)
+        fit.missing |= dict.fromkeys(FLICKER_PARAMETERS, "needs a flicker recording")
     if noise is None:
         fit.missing |= dict.fromkeys(CONSTANT_LIGHT_PARAMETERS, "needs a static recording")
     else:
@@ -98,7 +97,7 @@ def fit_sensor(
     return fit
 
 
-def _fit_known(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
+def _fit_flicker(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
     """Enter bandwidth and thresholds; returns the relative deviations of the ON and OFF thresholds."""
     pixels = sources[0].events.pixels
     names = " and ".join(source.name for source in sources)
@@ -111,7 +110,7 @@ def _fit_known(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tup
         if len(values) < MIN_PIXELS:
             raise ValueError(
                 f"{names}: expected {polarity.upper()} thresholds of at least {MIN_PIXELS} pixels, got {len(values)}; "
-                f"record for longer, with more contrast, and check that frames and events share clock and pixels"
+                f"record for longer, with more contrast, and check the frequency"
             )
         if len(values) < 0.9 * pixels:
             fit.notes.append(
@@ -143,14 +142,11 @@ def _grouped_error(function: Callable[[list[PixelThresholds]], float], threshold
 
 
 def _enter_noise(fit: SensorFit, noise: Noise, light: float, deviations: tuple[float, float]) -> None:
-    """Enter shot noise, its spread, jitter and hot pixels; `deviations` are the relative ones of the thresholds."""
+    """Enter shot noise and hot pixels; `deviations` are the relative ones of the thresholds."""
     rate = noise.shot_on_hz + noise.shot_off_hz
     value = nominal_shot_noise_hz(rate, light, *deviations)
     source = f"{noise.duration_s:.0f} s under constant light of {light:g} DN"
     fit.estimates["shot_noise_rate_hz"] = Estimate(value, value * noise.shot_error_hz / rate, source)
-    for name, spread in (("noise_rate_cov_decades", noise.leak_spread), ("leak_jitter", noise.leak_jitter)):
-        precise = spread.error < MAX_SPREAD_ERROR * spread.value
-        fit.enter(name, spread if precise else None, "too few leak events")
     count, rates_hz = len(noise.hot_rates_hz), noise.hot_rates_hz
     source = "more than 10 times the events of their neighbours under constant light"
     share = Estimate(float(noise.hot.mean()), math.sqrt(max(count, 1)) / len(noise.hot), source)

@@ -1,45 +1,28 @@
-"""Known light on a camera (frames with their times, or a sinusoidal flicker), and its change between events of a pixel.
+"""A sinusoidal flicker on all pixels of a camera, and its change between two events of a pixel.
 
 Light is in digital numbers (DN): 0 is dark, 255 white.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import minimize_scalar
 
 from polarnet.characterization.intervals import Intervals, PixelEvents, chosen_pixels, intervals_of, undisturbed
 from polarnet.events.stream import Events
-from polarnet.pictures.clips import TIMES_FILE, check_times, times_from_file
-from polarnet.pictures.images import picture_extensions, read_channels
-from polarnet.simulation.compilation import compiled
-from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
-from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
+from polarnet.simulation.pixels.light import FULL_SCALE, respond_as_v2e
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, PixelConfig, physics_of
 
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # of sRGB's primaries (IEC 61966-2-1)
-STEPS_PER_CYCLE = 256  # linear pieces of a flicker's cycle: 3e-4 of the contrast off at most
-PIECES = 4  # linear pieces of the response between two frames
-SETTLED = 12.0  # time constants of the photoreceptor after which a cycle repeats itself
-SETTLING_US = 100_000  # after the first frame, left out, because the photoreceptor's state is unknown
+STEPS_PER_CYCLE = 256  # linear pieces of a cycle: 3e-4 of the contrast off at most
 PHASES = 32
-PHASE_INTERVALS = 6000  # intervals that the phase of a flicker is fitted to
+PHASE_INTERVALS = 6000  # intervals that the phase is fitted to
 BLOCK = 8  # consecutive intervals; even blocks make one half of the data, odd blocks the other
-
-
-@dataclass(frozen=True)
-class MovingLight:
-    """Light on every pixel at successive times; between two frames the pixel's response is a cubic (`_responses`)."""
-
-    frames: Float32[np.ndarray, "n h w"]
-    """DN"""
-    t_us: Float64[np.ndarray, " n"]
-    """Times of the frames on the recording's clock."""
 
 
 @dataclass(frozen=True)
@@ -63,76 +46,42 @@ class Flicker:
                 f"{FULL_SCALE:g} DN, got {self.level} DN at contrast {self.contrast}; lower the mean"
             )
 
+    def light(self, phase: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """DN at phases in radians."""
+        return self.level * (1 + self.contrast * np.sin(phase))
 
-def read_light(folder: Path, height: int, width: int) -> MovingLight:
-    """Frames of `folder` in the order of their names, with the times in its `timestamps.txt`.
 
-    Frames are 8- or 16-bit pictures (white becomes 255 DN; colour becomes luminance without linearisation) or .npy
-    files in DN. `timestamps.txt` has one time per line in microseconds of the recording's clock; further words of a
-    line and lines that start with # are ignored. ValueError where the frames do not fit the sensor or the times.
+@dataclass(frozen=True)
+class FlickerRecording:
+    """A recording under a flicker whose phase is not known."""
+
+    name: str
+    events: Events
+    flicker: Flicker
+
+
+def flicker_cycle(flicker: Flicker, pixel: PixelConfig, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+    """Response of `pixel` behind a photoreceptor of bandwidth `cutoff_hz` (0: infinite) over one settled cycle.
+
+    It has `STEPS_PER_CYCLE` steps from phase 0 to 2 pi inclusive. As in `pixels.exact`, the response to the light is
+    linear within a step, and the bandwidth is that at the step's mean light.
     """
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: there is no such folder; name the folder of the frames")
-    kinds = picture_extensions() | {"npy"}
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower().lstrip(".") in kinds)
-    t_us = times_from_file(folder / TIMES_FILE, "us")
-    if len(paths) != len(t_us) or len(paths) < 2:
-        raise ValueError(
-            f"{folder}: expected at least two frames and one time for each, got {len(paths)} frames and "
-            f"{len(t_us)} times; {TIMES_FILE} needs one line per frame, in the order of the names"
-        )
-    check_times(t_us, TIMES_FILE)
-    frames = np.empty((len(paths), height, width), np.float32)
-    for frame, path in zip(frames, paths, strict=True):
-        light = _read_frame(path)
-        if light.shape != (height, width):
-            raise ValueError(
-                f"{path.name}: expected a frame of the sensor's {height} x {width} px (height x width), got "
-                f"{light.shape[0]} x {light.shape[1]}; cut and scale the frames to the pixels of the sensor"
-            )
-        frame[:] = light
-    return MovingLight(frames, t_us)
+    light = flicker.light(np.linspace(0, 2 * math.pi, STEPS_PER_CYCLE + 1))
+    rounded = np.empty(len(light), np.float32)
+    respond_as_v2e(light.astype(np.float32), physics_of(pixel), rounded)
+    response = rounded.astype(np.float64)
+    if cutoff_hz == 0:
+        return response
+    bandwidth_hz = cutoff_hz * (0.5 * (light[1:] + light[:-1]) + DARK_OFFSET) / SATURATION
+    per_step = 2 * math.pi * bandwidth_hz / (flicker.frequency_hz * STEPS_PER_CYCLE)
+    decay = np.exp(-per_step)
+    steps = np.stack([decay, -np.diff(response) * (1 - decay) / per_step], axis=1).tolist()
 
+    def lags(first: float) -> list[float]:
+        """Filtered response less the response at each step, from the first one on."""
+        return list(itertools.accumulate(steps, lambda lag, step: lag * step[0] + step[1], initial=first))
 
-def _read_frame(path: Path) -> Float[np.ndarray, "h w"]:
-    if path.suffix.lower() == ".npy":
-        light = np.load(path)
-    else:
-        pixels = read_channels(path)
-        white = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1.0
-        light = pixels.astype(np.float32) * (FULL_SCALE / white)
-        light = light[..., :3] @ np.array(LUMINANCE, np.float32) if light.shape[-1] >= 3 else light[..., 0]
-    if light.ndim != 2 or not np.isfinite(light).all() or light.min() < 0 or light.max() > FULL_SCALE * (1 + 1e-6):
-        raise ValueError(f"{path.name}: expected one value from 0 to {FULL_SCALE:g} DN per pixel, [height, width]")
-    return light
-
-
-def moving_responses(
-    light: MovingLight, pixel: Int64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], cutoff_hz: float
-) -> Float64[np.ndarray, " n"]:
-    """Filtered response of each event's pixel at its time; NaN outside the frames' times.
-
-    Events are ordered by pixel, then time. Between two frames the response to the light is a cubic (Catmull and Rom) in
-    `PIECES` linear pieces; its slope at a frame is that of a parabola through three frames. A straight line would shift
-    increments of short and long intervals by different amounts and so feign a leak. The filter is that of
-    `pixels.exact` with the bandwidth at the mean light of a piece. It starts adapted to the first frame.
-    """
-    frames = light.frames.reshape(len(light.frames), -1)
-    starts = np.searchsorted(pixel, np.arange(frames.shape[1] + 1))
-    return _responses(frames, light.t_us, starts, t_us, cutoff_hz)
-
-
-def flicker_cycle(flicker: Flicker, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
-    """Filtered response over one settled cycle, from phase 0 to 2 pi inclusive, in `STEPS_PER_CYCLE` steps."""
-    slowest_hz = cutoff_hz * (flicker.level * (1 - flicker.contrast) + DARK_OFFSET) / SATURATION
-    cycles = 2 + (math.ceil(SETTLED * flicker.frequency_hz / (2 * math.pi * slowest_hz)) if cutoff_hz > 0 else 0)
-    phase = np.arange(cycles * STEPS_PER_CYCLE + 1) * (2 * math.pi / STEPS_PER_CYCLE)
-    light = flicker.level * (1 + flicker.contrast * np.sin(phase))
-    t_us = phase / (2e-6 * math.pi * flicker.frequency_hz)
-    responses = _responses(
-        light.astype(np.float32)[:, None], t_us, np.array([0, len(t_us)]), np.minimum(t_us, t_us[-1] - 1e-3), cutoff_hz
-    )
-    return responses[-STEPS_PER_CYCLE - 1 :]
+    return response + lags(lags(0.0)[-1] / (1 - float(decay.prod())))  # a settled cycle ends where it begins
 
 
 def flicker_responses(
@@ -143,24 +92,13 @@ def flicker_responses(
     return np.interp(turns, np.linspace(0, 1, len(cycle)), cycle)
 
 
-@dataclass(frozen=True)
-class KnownLight:
-    """A recording under known light."""
-
-    name: str
-    events: Events
-    light: MovingLight | Flicker
-
-
 class Source(NamedTuple):
-    """Intervals of a recording under known light, and the filtered response at its events for a bandwidth."""
+    """Intervals of a recording under a flicker, and the filtered response at its events for a bandwidth."""
 
     name: str
     events: PixelEvents
     intervals: Intervals
     responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
-    moves: bool
-    """Whether the light is a moving scene with frames, not a flicker."""
 
 
 class Increments(NamedTuple):
@@ -173,29 +111,21 @@ class Increments(NamedTuple):
     block: Int64[np.ndarray, " n"]
 
 
-def source_of(known: KnownLight, events: PixelEvents, refractory_us: float) -> Source:
-    """The intervals of a recording under known light that neither start-up nor refractory period disturbs."""
+def source_of(recording: FlickerRecording, events: PixelEvents, pixel: PixelConfig, refractory_us: float) -> Source:
+    """The intervals of a recording that the refractory period does not disturb; `events` are those of `recording`."""
     intervals = undisturbed(intervals_of(events), refractory_us)
-    light = known.light
-    if isinstance(light, MovingLight):
-        after = events.t_us[intervals.start] >= light.t_us[0] + SETTLING_US
-        intervals = Intervals(*(column[after] for column in intervals))
+    flicker = exact_frequency(recording.flicker, events)
 
-        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
-            return moving_responses(light, some.pixel, some.t_us, cutoff_hz)
-    else:
-        flicker = exact_frequency(light, events)
+    @functools.cache
+    def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
+        cycle = flicker_cycle(flicker, pixel, cutoff_hz)
+        return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
 
-        @functools.cache
-        def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
-            cycle = flicker_cycle(flicker, cutoff_hz)
-            return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+    def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+        cycle, phase = cycle_and_phase(cutoff_hz)
+        return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
 
-        def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
-            cycle, phase = cycle_and_phase(cutoff_hz)
-            return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
-
-    return Source(known.name, events, intervals, responses, isinstance(light, MovingLight))
+    return Source(recording.name, events, intervals, responses)
 
 
 def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
@@ -204,10 +134,9 @@ def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
     for source in sources:
         response, intervals = source.responses(source.events, cutoff_hz), source.intervals
         increment = np.where(intervals.on, 1.0, -1.0) * (response[intervals.stop] - response[intervals.start])
-        covered, block = np.isfinite(increment), np.arange(len(increment)) // BLOCK
-        columns = increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block
-        parts.append([column[covered] for column in columns])
-    return Increments(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        block = np.arange(len(increment)) // BLOCK
+        parts.append((increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block))
+    return Increments(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def at_pixels(source: Source, mask: Bool[np.ndarray, " pixels"]) -> Source:
@@ -257,59 +186,3 @@ def flicker_phase(
     best = grid[np.argmin([unequal(phase) for phase in grid])]
     width = 2 * math.pi / PHASES
     return float(minimize_scalar(unequal, bounds=(best - width, best + width), method="bounded").x)
-
-
-@compiled
-def _response(dn):
-    return dn * (math.log(KNEE) / KNEE) if dn <= KNEE else math.log(dn)
-
-
-@compiled
-def _light(response):
-    knee = math.log(KNEE)
-    return max(response, 0.0) * (KNEE / knee) if response <= knee else math.exp(response)
-
-
-@compiled
-def _responses(frames, times_us, starts, t_us, cutoff_hz):
-    values = np.full(t_us.size, np.nan)
-    frame_count = times_us.size
-    for i in range(starts.size - 1):
-        event, stop = starts[i], starts[i + 1]
-        while event < stop and t_us[event] < times_us[0]:
-            event += 1
-        lag, before, after = 0.0, _response(np.float64(frames[0, i])), _response(np.float64(frames[1, i]))
-        tangent = (after - before) / (times_us[1] - times_us[0])
-        for k in range(frame_count - 1):
-            if event >= stop:
-                break
-            duration = times_us[k + 1] - times_us[k]
-            beyond, next_tangent = after, (after - before) / duration
-            if k + 2 < frame_count:  # slope of the parabola through three frames
-                beyond, next_duration = _response(np.float64(frames[k + 2, i])), times_us[k + 2] - times_us[k + 1]
-                next_tangent *= next_duration / (duration + next_duration)
-                next_tangent += (beyond - after) / next_duration * (duration / (duration + next_duration))
-            c1, rise = tangent * duration, after - before
-            c2, c3 = 3 * rise - 2 * c1 - next_tangent * duration, c1 + next_tangent * duration - 2 * rise
-            piece_us, response, piece_start_us = duration / PIECES, before, times_us[k]
-            light = _light(response)
-            for piece in range(1, PIECES + 1):
-                u = piece / PIECES
-                response_after = before + u * (c1 + u * (c2 + u * c3))
-                slope = (response_after - response) / piece_us
-                light_after = _light(response_after)
-                per_us = 2e-6 * math.pi * cutoff_hz * (0.5 * (light + light_after) + DARK_OFFSET) / SATURATION
-                end_us = times_us[k + 1] if piece == PIECES else piece_start_us + piece_us
-                while event < stop and t_us[event] < end_us:
-                    since = t_us[event] - piece_start_us
-                    values[event] = response + slope * since
-                    if cutoff_hz > 0:
-                        decay = math.exp(-per_us * since)
-                        values[event] += lag * decay - slope * (1 - decay) / per_us
-                    event += 1
-                if cutoff_hz > 0:
-                    decay = math.exp(-per_us * piece_us)
-                    lag = lag * decay - slope * (1 - decay) / per_us
-                response, light, piece_start_us = response_after, light_after, end_us
-            before, after, tangent = after, beyond, next_tangent
-    return values

@@ -1,4 +1,4 @@
-"""Contrast thresholds of each pixel, how they vary, and the bandwidth, from increments under known light.
+"""Contrast thresholds of each pixel, how they vary, and the bandwidth, from increments under a flicker.
 
 An increment of duration T that ends with an ON event is (1 - r T) ON thresholds for a leak of r hertz; with an OFF
 event, one OFF threshold plus r T ON thresholds; with shot noise, anything below. A pixel's threshold is the robust mean
@@ -50,7 +50,7 @@ def pixel_thresholds(
     positive = increment > 0.01
     increment, pixel, block = increment[positive], pixel[positive], block[positive]
     if len(increment) == 0:
-        raise ValueError("expected events that follow the light, got none; check the frames' times and their order")
+        raise ValueError("expected events that follow the light, got none; check the frequency of the flicker")
     start = np.full(pixels, _most_frequent(increment))
     near = np.abs(np.log(increment / start[0])) < 0.9
     start = _medians(increment[near], pixel[near], start)
@@ -151,9 +151,7 @@ def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> tu
 
 
 def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
-    """Bandwidth in Hz, from flickers if there are any, else from all sources; None if the data do not determine it."""
-    flickers = [source for source in sources if not source.moves]
-    sources = flickers or sources
+    """Bandwidth in Hz; None if the data do not determine it."""
     pixels = sources[0].events.pixels
     busy = np.flatnonzero(sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK)
     if len(busy) < GROUPS:

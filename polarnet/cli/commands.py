@@ -13,8 +13,6 @@ Command: TypeAlias = argparse.ArgumentParser
 AddCommand: TypeAlias = Callable[..., Command]
 """`_command` without its first argument."""
 
-BESIDE = ""
-"""Value of --truth without a path."""
 _wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
 
 
@@ -185,7 +183,7 @@ def _inspect(command: AddCommand) -> None:
         "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs, and "
         "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
     )
-    inspect.add_argument("file", help="file of a camera, an event store with --part, or a store to list")
+    inspect.add_argument("file", help="file of a camera, or a store to list")
     _reading(inspect)
     inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
 
@@ -197,7 +195,7 @@ def _recover(command: AddCommand) -> None:
         "recover DoLP and AoLP from recordings or from a running camera",
         'recover recording.aedat4 --mosaic "90 45 / 135 0"',
         "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
-        "recover outputs/simulate/lake/events.zarr --truth",
+        "recover outputs/simulate/lake/events.zarr",
         "recover data/events.zarr --sequence lake-0 --step 1ms --write mp4",
         "recover camera.raw --rotating 15",
         'recover dv://camera --live --mosaic "90 45 / 135 0"',
@@ -220,10 +218,6 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--triggers", type=Path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
     add("--start-angle", type=float, metavar="DEG", help="its angle at time 0 or the first trigger (default: 0)")
     add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
-    add(
-        "--truth", nargs="?", const=BESIDE, metavar="FRAMES",
-        help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
-    )  # fmt: skip
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
@@ -256,8 +250,8 @@ def _convert(command: AddCommand) -> None:
         "convert recording.aedat4 first.h5 --start 500ms --stop 2s",
         "convert data/events.zarr exported --to evt3 --sequence lake-0",
         description="Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its "
-        "events, or those of a time span. Times in OUT count from the start of the span. Of an event store without "
-        "--part, writes a folder with one file for each sequence and channel.",
+        "events, or those of a time span. Times in OUT count from the start of the span. Of an event store, "
+        "writes a folder with one file for each sequence and channel.",
     )
     add = convert.add_argument
     add("file", metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
@@ -274,21 +268,15 @@ def _fit_sensor(command: AddCommand) -> None:
         "fit-sensor",
         "fit_sensor.run",
         "fit the simulated sensor to a camera's recordings",
-        "fit-sensor --name lab --static dark.raw --static-light 0 --moving walk.raw --frames frames/",
+        "fit-sensor --name lab --static wall.raw --flicker f2.raw f60.raw --frequency 2 60 --contrast 0.8",
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
-        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and draws each "
-        "recording beside its simulated twin. docs/fit-sensor.md says what to record.",
+        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and says how alike each "
+        "recording and its simulated twin are. docs/fit-sensor.md says what to record.",
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
     add("--static", type=Path, metavar="FILE", help="recording under constant light")
     add("--static-light", type=float, metavar="DN", help="its brightness, 0 (covered lens) to 255 (default: 127.5)")
-    add("--moving", type=Path, metavar="FILE", help="recording of a moving scene")
-    add(
-        "--frames", type=Path, metavar="FOLDER",
-        help="frames of the moving scene at the pixels of the sensor, and timestamps.txt: a time a frame in "
-        "microseconds of the recording's clock",
-    )  # fmt: skip
     add("--flicker", type=Path, nargs="+", metavar="FILE", help="recordings of a lamp or display with sinusoidal light")
     add("--contrast", type=float, metavar="C", help="contrast of the flicker, (max - min) / (max + min)")
     add("--frequency", type=float, nargs="+", metavar="HZ", help="frequency of each flicker recording")
@@ -358,8 +346,7 @@ def _reading(command: Command) -> None:
     """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
     command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
     command.add_argument(
-        "--part", help="of a file with several: topic of a bag, stream of AEDAT, SEQUENCE/ANGLE of an event store"
+        "--part", help="of a file with several: topic of a bag, stream of AEDAT, camera of M3ED or MVSEC"
     )
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
     command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
-    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")

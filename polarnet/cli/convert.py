@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarnet.cli.options import READING, duration_us, given, reading_of
+from polarnet.cli.options import READING, duration_us, reading_of, refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.stores import is_store
 from polarnet.events.stream import Events, slice_time
@@ -24,17 +24,16 @@ SUFFIXES = {".h5": "hdf5", ".hdf5": "hdf5", ".txt": "text", ".raw": "evt3"}
 
 def convert(options: argparse.Namespace) -> None:
     """Convert a recording, or the sequences of an event store."""
-    if options.part is None and is_store(options.file):
+    if is_store(options.file):
         _convert_store(options)
     elif options.sequence:
-        raise ValueError("--sequence: expected an event store without --part; leave it out")
+        raise ValueError("--sequence: expected an event store; leave it out")
     else:
         _convert_recording(options, Path(options.file))
 
 
 def _convert_store(options: argparse.Namespace) -> None:
-    if listed := given(options, ["start", "stop", *READING]):
-        raise ValueError(f"an event store: expected no {listed} without --part; leave it out")
+    refuse(options, "an event store", ["start", "stop", "part", *READING])
     store = EventStore.open(options.file)
     with run_folder(options.out, "convert") as folder:
         export_store(store, folder, options.to or "hdf5", options.sequence)

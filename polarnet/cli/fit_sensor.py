@@ -5,14 +5,12 @@ import re
 from pathlib import Path
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
-from polarnet.characterization.light import Flicker, KnownLight, MovingLight, read_light
+from polarnet.characterization.light import Flicker, FlickerRecording
 from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.events.stream import Events
 from polarnet.recordings.recording import read_recording
-from polarnet.reports.maps import png
-from polarnet.reports.realism import realism_figure
 from polarnet.simulation.presets import SENSORS
 
 WRITTEN_BY = "# Written by `polarnet fit-sensor`"
@@ -26,8 +24,6 @@ UNITS = {
     "cutoff_hz": "Hz",
     "refractory_period_us": "us",
     "leak_rate_hz": "Hz",
-    "noise_rate_cov_decades": "decades",
-    "leak_jitter": "",
     "shot_noise_rate_hz": "Hz",
     "hot_pixel_share": "",
     "hot_pixel_rate_hz": "Hz",
@@ -36,7 +32,7 @@ UNITS = {
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit, print the table, write the sensor, and draw each recording beside its twin."""
+    """Fit, print the table, write the sensor, and print how alike each recording and its simulated twin are."""
     check_options(options)
     preset = _preset_path(options.name)
 
@@ -44,51 +40,39 @@ def run(options: argparse.Namespace) -> None:
         return read_recording(path, part=options.part, **reading_of(options)).events
 
     static = read(options.static) if options.static else None
-    moving = read(options.moving) if options.moving else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
-    known: list[KnownLight] = []
-    lights: list[tuple[str, Events, MovingLight | Flicker | float]] = []
+    flickers: list[FlickerRecording] = []
+    lights: list[tuple[str, Events, Flicker | float]] = []
     if static is not None:
         lights.append((f"static: {options.static.name}", static, static_light))
-    if moving is not None and options.frames:
-        known.append(KnownLight("moving", moving, read_light(options.frames, moving.height, moving.width)))
-        lights.append((f"moving: {options.moving.name}", moving, known[-1].light))
     for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
         flicker = Flicker(options.flicker_light, options.contrast, frequency_hz)
-        known.append(KnownLight(f"flicker {frequency_hz:g} Hz", read(path), flicker))
-        lights.append((f"flicker: {path.name}", known[-1].events, flicker))
-    fit = fit_sensor(static, static_light, known, [moving] if moving is not None and not options.frames else [])
+        flickers.append(FlickerRecording(f"flicker {frequency_hz:g} Hz", read(path), flicker))
+        lights.append((f"flicker: {path.name}", flickers[-1].events, flicker))
+    fit = fit_sensor(static, static_light, flickers, SENSORS["default"])
     notes = list(fit.notes)
     if options.static and options.static_light is None:
         notes.append(
             f"Brightness of the static recording: {MIDDLE_DN} DN is assumed, so shot noise may be wrong by a factor of "
             f"up to 2.4; give --static-light"
         )
-    rows = _rows(fit)
-    for parameter, estimate, error, source in [("parameter", "estimate", "std. error", "from"), *rows]:
+    for parameter, estimate, error, source in [("parameter", "estimate", "std. error", "from"), *_rows(fit)]:
         print(f"{parameter:32}{estimate:24}{error:12}{source}".rstrip())
     for note in notes:
         print(f"note: {note}")
     preset.parent.mkdir(parents=True, exist_ok=True)
     preset.write_text(_preset_text(options.name, fitted_parameters(fit)), encoding="utf-8")
     sensor = fitted_sensor(fit, SENSORS["default"])
-    comparisons = [compare(name, events, light, sensor, seed=1) for name, events, light in lights if len(events) > 1]
-    for comparison in comparisons:
-        print(f"{comparison.name}: {comparison.verdict}")
+    for name, events, light in lights:
+        if len(events) > 1:
+            print(f"{name}: {compare(events, light, sensor, seed=1).verdict}")
     print(f"sensor      {preset} (use it with sensor={options.name})")
-    if comparisons:
-        picture = Path("outputs", "fit-sensor", f"{options.name}.png")
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        picture.write_bytes(png(realism_figure(comparisons)))
-        print(f"picture     {picture}")
 
 
 def check_options(options: argparse.Namespace) -> None:
     """ValueError for options that are missing, or that do not belong together."""
-    if not (options.static or options.moving or options.flicker):
-        raise ValueError("expected a recording; give --static, --moving with --frames, or --flicker")
-    if options.frames and not options.moving:
-        raise ValueError("--frames: expected the recording of these frames; give --moving FILE")
+    if not (options.static or options.flicker):
+        raise ValueError("expected a recording; give --static or --flicker")
     if options.static_light is not None and not (options.static and 0 <= options.static_light <= 255):
         raise ValueError(
             f"--static-light: expected 0 to 255 DN and --static FILE, got {options.static_light}; white is 255"

@@ -35,8 +35,8 @@ UNFINISHED = (".tmp", ".partial")
 
 def inspect(options: argparse.Namespace) -> None:
     """Print a summary of a camera's file and draw it, or list the sequences of a store."""
-    if options.part is None and is_store(options.file):
-        refuse(options, "a store without --part", READING)
+    if is_store(options.file):
+        refuse(options, "a store", ["part", *READING])
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
@@ -56,11 +56,11 @@ def inspect(options: argparse.Namespace) -> None:
 def view(options: argparse.Namespace) -> None:
     """Write a page that plays a store, a recording or a recovery, and open it."""
     open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
-    if options.part is not None or is_recording(options.path):
+    if is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
         films = [recording_film(options.path, open_file)]
     else:
-        refuse(options, "a store or a folder", READING)
+        refuse(options, "a store or a folder", ["part", *READING])
         films = films_of(options.path, options.sequence or ())
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)

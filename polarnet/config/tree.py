@@ -117,7 +117,6 @@ class Paths:
     rotating: str
     benchmark: str
     report: str
-    imported: str
     calibrated: str
     resume: str
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from polarnet.events.streaming import MAX_PAUSE_US
-from polarnet.recordings.source import REPAIRS, SAFE, Block, Counts, RecordingError, Source, joined
+from polarnet.recordings.source import REPAIRS, SAFE, Block, Blocks, Counts, RecordingError, joined
 
 LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
@@ -33,8 +33,10 @@ NOTHING = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int
 logger = logging.getLogger(__name__)
 
 
-def repaired(name: str, source: Source, counts: Counts, bridged_us: int = 0) -> Iterator[Block]:
-    """The events of a source, t as int64, x and y as int16, p as int8; repairs are added to `counts`.
+def repaired(
+    name: str, blocks: Blocks, sensor: tuple[int, int], counts: Counts, bridged_us: int = 0
+) -> Iterator[Block]:
+    """The events on a sensor (height, width): t int64, x and y int16, p int8; repairs are added to `counts`.
 
     RecordingError, beginning with `name`, where damage is not safe to repair, after the events before it: more than 1 %
     of the events (and 8) of one kind, or a clock that was set anew `bridged_us` after the first event or later.
@@ -42,13 +44,13 @@ def repaired(name: str, source: Source, counts: Counts, bridged_us: int = 0) -> 
     clock = Clock(name, counts, bridged_us=bridged_us)
     darker: int | None = None
     events = 0
-    for block in source.blocks(counts):
+    for block in blocks(counts):
         events += len(block.t)
         darker = _darker(block.p) if darker is None else darker
         for column in (block.x, block.y):
             if column.dtype.kind == "f" and not np.equal(column, np.floor(column)).all():
                 raise RecordingError(f"{name}: expected x and y to be whole numbers")
-        good = usable(block, source.height, source.width, darker, counts)
+        good = usable(block, *sensor, darker, counts)
         for ready in clock.ordered(_typed(block if good.all() else block.rows(good))):
             refuse_much_damage(name, counts, events)
             yield ready

@@ -84,18 +84,21 @@ class Choices:
     height: int | None = None
     width: int | None = None
     part: str | None = None
-    """SEQUENCE/ANGLE of an event store, a topic of a bag, a stream of AEDAT, or a camera of a file with two."""
-    clock_mhz: float | int | None = None
-    """Clock of a CeleX-5; None: 100 MHz in a BIN file, and times in microseconds in a CSV file."""
+    """A topic of a bag, a stream of AEDAT, or a camera of a file with two."""
+
+
+Blocks = Callable[[Counts], Iterator[Block]]
+"""Reads a file from its start, and counts the data it had to leave out."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """An opened file. `blocks(counts)` reads it from the start and counts the data it had to leave out."""
+    """An opened file."""
 
-    height: int
-    width: int
-    blocks: Callable[[Counts], Iterator[Block]]
+    height: int | None
+    """None if the file does not state the size."""
+    width: int | None
+    blocks: Blocks
 
 
 class CameraFrames(NamedTuple):

@@ -14,7 +14,6 @@ import numba
 import numpy as np
 
 from polarnet.events.stream import Events, slice_count
-from polarnet.recordings.formats.store import channel_chunks
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 from polarnet.terminal.installation import installation
@@ -231,7 +230,7 @@ def export_store(
         for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
             path = folder / sequence / f"polarizer_{angle:03d}{suffix}"
             nothing = Events.empty(store.height, store.width)  # so that a channel without events has a size
-            write(path, itertools.chain([nothing], channel_chunks(store, sequence, channel)), duration_us)
+            write(path, itertools.chain([nothing], _channel_chunks(store, sequence, channel)), duration_us)
     contents = {
         "form": form,
         "height": store.height,
@@ -242,6 +241,13 @@ def export_store(
         "attributes": store.attributes,
     }
     (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+
+
+def _channel_chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
+    """The events of one channel of a sequence, in chunks."""
+    first, end = store.record(sequence)["offsets"][channel : channel + 2]
+    for start in range(first, end, BLOCK):
+        yield from store.rows(sequence, [(start, min(start + BLOCK, end))])
 
 
 def h5py_module() -> Any:

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.targets import calibrate_targets, import_targets
+from polarnet.captures.targets import calibrate_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
 from polarnet.events.streaming import WindowRule
@@ -20,13 +19,13 @@ from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, o
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
-from polarnet.recordings.recording import detect_format, open_recording
+from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.storage.events import EventStore
-from polarnet.storage.parts import unknown_sequence
+from polarnet.storage.parts import METADATA, unknown_sequence
 
 STANDARD_INPUT = "-"
 STEPS_PER_BLOCK = 64  # steps of the store's index, 2**14 events each
@@ -53,8 +52,9 @@ def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clea
     """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, a folder
-    that `polarnet export` wrote, or a folder of division-of-time captures, which are calibrated in `work`. `clean`
-    removes noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
+    that `polarnet convert` wrote, or a folder of division-of-time captures, which are calibrated in `work`, a folder
+    without other targets. `clean` removes noise before the size is reduced. A ValueError or FileNotFoundError says what
+    is missing.
     """
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
@@ -135,7 +135,7 @@ def _channels(files: Files, work: Path) -> Channels:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        return open_four(dict(zip(files.angles, files.paths, strict=True)), open_file=files.open)
+        return open_four(dict(zip(files.angles, files.paths, strict=True)), files.open)
     if len(files.paths) != 1 or files.angles is not None:
         raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
     (path,) = files.paths
@@ -144,8 +144,8 @@ def _channels(files: Files, work: Path) -> Channels:
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captured(path, work, files.captures)
     if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return open_four(exported, dict.fromkeys(exported, 0), files.open)  # times count from the sequence's start
-    if detect_format(path) == "store":
+        return open_four(exported, files.open, origin_us=0)  # times count from the sequence's start
+    if (path / METADATA).is_file():
         store = EventStore.open(path)
         return _stored(store, _named(files.sequence, store.sequences, path.name))
     if files.plain:
@@ -170,7 +170,7 @@ def _stored(store: EventStore, sequence: str) -> Channels:
 
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet export` or `polarnet simulate` wrote; empty for any other folder."""
+    """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
     if (folder / EXPORT_INDEX).is_file():
         names = sorted(path.name for path in folder.iterdir() if path.is_dir())
         folder = folder / _named(sequence, names, folder.name)
@@ -198,12 +198,10 @@ def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Chan
     if config is None:
         raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
     root = work / "targets"
-    shutil.rmtree(root, ignore_errors=True)  # of a run on another folder, maybe of the same name
     root.mkdir(parents=True)
     target = root / folder.resolve().name
     target.symlink_to(folder.resolve(), target_is_directory=True)
-    import_targets(root, work / "imported", config)
-    calibrate_targets(work / "imported", work / "calibrated", config, {})
+    calibrate_targets(root, work / "calibrated", config, {})
     return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 

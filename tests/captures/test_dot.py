@@ -17,7 +17,6 @@ from polarnet.captures.dot import (
     landmark_starts,
     read_intensity_capture,
     reduced,
-    regular_times_us,
 )
 from polarnet.config.tree import load
 from polarnet.recordings.source import RecordingError
@@ -108,20 +107,6 @@ def test_starts_given_by_hand_take_the_place_of_the_rule(config, make_events):
     events, intensities = {"events_0": make_events([], HEIGHT, WIDTH)}, {"intensity_0": pictures([100.0, 1.0])}
     starts = landmark_starts(events, intensities, config, {"events_0": 123})
     assert starts == {"events_0": 123, "intensity_0": 10_000}
-
-
-def test_pictures_stamped_in_whole_milliseconds_get_the_times_of_their_regular_clock():
-    true_us = 5_400 + np.arange(40) * 16_667
-    assert np.abs(regular_times_us("a", true_us // 1000 * 1000) - true_us).max() < 300
-    without_some = np.delete(true_us, [7, 20, 21])
-    assert np.abs(regular_times_us("a", without_some // 1000 * 1000) - without_some).max() < 300
-
-
-def test_pictures_of_no_regular_clock_get_the_middles_of_their_milliseconds():
-    stamps = np.array([0, 10, 47, 61, 150, 158, 300]) * 1000
-    assert regular_times_us("a", stamps).tolist() == (stamps + 500).tolist()
-    with pytest.raises(RecordingError, match="a: picture 2 is stamped 3000 us"):
-        regular_times_us("a", np.array([0, 5000, 3000]))
 
 
 def test_a_picture_is_reduced_by_averaging(config):

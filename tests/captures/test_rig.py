@@ -10,7 +10,7 @@ import torch
 from polarnet import stokes
 from polarnet.benchmark.run import run_benchmark
 from polarnet.captures.dot import RecordingsConfig, find_captures
-from polarnet.captures.targets import calibrate_targets, import_targets
+from polarnet.captures.targets import calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
@@ -67,8 +67,7 @@ def rig(project_root, config, tmp_path_factory):
 def calibrated(rig, config, tmp_path_factory):
     root, truth = rig
     folder = tmp_path_factory.mktemp("calibrated")
-    import_targets(root, folder / "imported", config)
-    (found,) = calibrate_targets(folder / "imported", folder / "out", config, {})
+    (found,) = calibrate_targets(root, folder / "out", config, {})
     return folder / "out", found, truth
 
 
@@ -121,13 +120,11 @@ def test_thresholds_and_hot_pixels_come_out_as_they_were_put_in(calibrated):
 
 def test_a_start_set_by_hand_stays(rig, config, tmp_path):
     root, truth = rig
-    imported = tmp_path / "imported"
     (root / "one" / "starts.json").write_text(json.dumps({"intensity_45": truth.start_us["intensity_45"]}))
     try:
-        import_targets(root, imported, config)
+        (found,) = calibrate_targets(root, tmp_path / "out", config, {})
     finally:
         (root / "one" / "starts.json").unlink()
-    (found,) = calibrate_targets(imported, tmp_path / "out", config, {})
     assert found.start_us["intensity_45"] == truth.start_us["intensity_45"]
 
 

@@ -77,7 +77,7 @@ def test_a_wrong_key_value_or_choice_is_refused_with_those_that_are_allowed(proj
             ["benchmark.sets=[simulated,measured]", "sets.measured_root=EMPTY"],
             "sets.measured_root=EMPTY: no",
         ),
-        ("import_recordings", ["recordings.enabled=true", "recordings.root=EMPTY"], "recordings.root=EMPTY: no files"),
+        ("calibrate", ["recordings.enabled=true", "recordings.root=EMPTY"], "recordings.root=EMPTY: no files"),
     ],
 )
 def test_a_stage_refuses_a_wrong_value_and_an_empty_folder_in_one_line(

@@ -72,7 +72,7 @@ def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         "ingest": ["images"], "synthesize": ["scenes.zarr", "frames.zarr"], "emulate": ["events.zarr"],
         "weights": ["weights/loss.json", "weights/benchmark.json"], "train": ["train/NAME"], "sets": ["sets"],
         "emulate_rotating": ["rotating"],
-        "import_recordings": ["imported"], "calibrate": ["calibrated"], "row": ["benchmark/rows/NAME"],
+        "calibrate": ["calibrated"], "row": ["benchmark/rows/NAME"],
         "report": [*(f"benchmark/{file}" for file in REPORT_OUTS), "report"],
     }  # fmt: skip
     (folder / "stages").mkdir()

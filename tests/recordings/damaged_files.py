@@ -92,8 +92,7 @@ def write_sample(form: str, path: Path, events: Events) -> None:
 def ending(path: Path, form: str | None, chunk_events: int) -> str:
     """One of ENDINGS. Whatever else a reader does (another error, events out of order, an unnamed file) is raised."""
     try:
-        part = "lake/135" if path.is_dir() else None  # of an event store
-        reader = open_recording(path, form, part=part, chunk_events=chunk_events)
+        reader = open_recording(path, form, chunk_events=chunk_events)
         before = None
         for events in reader:
             validate(events)

@@ -141,18 +141,6 @@ def test_comments_may_come_before_the_size_in_pieces_of_their_own():
         assert next(iter(live)).until_us == 0
 
 
-def test_wrong_times_are_dropped_and_a_reset_of_the_clock_goes_on_with_one_warning(tmp_path, caplog):
-    stale, steady = range(5 * 10**9, 5 * 10**9 + 5), range(10**9, 10**9 + 400_000, 1000)
-    times = [*stale, *steady[:200], 10**12, *steady[200:], *range(0, 400_000, 1000), *range(0, 400_000, 1000)]
-    live, pieces = read_lines(tmp_path, "4 3\n" + "".join(f"{t} 1 1 1 45\n" for t in times))
-    counts = {kind: count for kind, count in live.counts.items() if count}
-    assert counts == {"stale": 5, "time_glitches": 1, "clock_resets": 2}
-    t = torch.cat([piece.channels[1].t for piece in pieces])
-    assert len(t) == len(times) - 6
-    assert (t.diff() >= 0).all()
-    assert sum("events go on as after a pause" in message for message in caplog.messages) == 1
-
-
 def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
     with pipe() as (source, camera):
         camera.write(b"4 3\n0 0 0 1 0\n")

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from polarnet.recordings.repair import FEW, LATE_US, MAX_RUN, MAX_STALE, Clock, repaired
-from polarnet.recordings.source import Block, Counts, RecordingError, Source
+from polarnet.recordings.source import Block, Counts, RecordingError
 
 
 def read(blocks, height=10, width=10):
     """Rows (t, x, y, p) and counts after repair of blocks of rows."""
     counts = Counts()
     tables = [np.array(rows, np.int64).reshape(-1, 4) for rows in blocks]
-    source = Source(height, width, lambda counts: (Block(*table.T) for table in tables))
-    mended = [np.stack([column.astype(np.int64) for column in block]) for block in repaired("a.bin", source, counts)]
+    ready = repaired("a.bin", lambda counts: (Block(*table.T) for table in tables), (height, width), counts)
+    mended = [np.stack([column.astype(np.int64) for column in block]) for block in ready]
     rows = np.concatenate(mended, axis=1).T.tolist() if mended else []
     return rows, {kind: count for kind, count in counts.items() if count}
 
@@ -141,8 +141,7 @@ def test_a_camera_that_was_reset_goes_on_even_if_its_events_come_one_by_one(capl
 
 def test_events_before_a_reset_are_handed_on_first():
     rows = at([*STEADY, *STEADY])
-    source = Source(10, 10, lambda counts: iter([Block(*np.array(rows).T)]))
-    blocks = repaired("a.bin", source, Counts())
+    blocks = repaired("a.bin", lambda counts: iter([Block(*np.array(rows).T)]), (10, 10), Counts())
     assert next(blocks).t.tolist() == STEADY
     with pytest.raises(RecordingError, match=r"a\.bin: after event 3000, time goes back by 2999000 us"):
         next(blocks)
@@ -161,11 +160,6 @@ def test_the_largest_step_back_that_is_repaired_is_ten_milliseconds():
     assert read([at([20_000, 20_000 - LATE_US - 1, *later])])[1] == {"time_glitches": 1}
 
 
-def test_pauses_are_kept_and_counted():
-    rows, counts = read([at([0, 1, 3_000_000, 3_000_001, 9_000_000])])
-    assert (times_of(rows), counts) == ([0, 1, 3_000_000, 3_000_001, 9_000_000], {"pauses": 2})
-
-
 def test_blocks_of_any_length_give_the_same_events():
     generator = np.random.default_rng(3)
     times = np.cumsum(generator.integers(0, 50, 2000)) + generator.integers(-5000, 5000, 2000)
@@ -178,6 +172,5 @@ def test_blocks_of_any_length_give_the_same_events():
 
 def test_fractional_pixels_are_refused():
     columns = Block(np.arange(3), np.array([0.0, 1.5, 2.0]), np.zeros(3), np.ones(3))
-    source = Source(10, 10, lambda counts: iter([columns]))
     with pytest.raises(RecordingError, match="x and y to be whole numbers"):
-        list(repaired("a.bin", source, Counts()))
+        list(repaired("a.bin", lambda counts: iter([columns]), (10, 10), Counts()))

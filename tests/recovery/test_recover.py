@@ -12,7 +12,7 @@ from event_fixtures import random_events
 from polarnet.cli import main
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
-from polarnet.events.stream import Events, slice_count, slice_time
+from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.base.checkpoint import save_checkpoint
@@ -22,7 +22,6 @@ from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
-from polarnet.recovery import inputs
 from polarnet.recovery.inputs import Files, open_files
 from polarnet.recovery.stream import ChosenMethod, frames_of, open_method
 from polarnet.runtime import machine as runtime
@@ -152,31 +151,6 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     assert out.getvalue() == head + lines
 
 
-def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channels, project_root, tmp_path, monkeypatch):
-    """Import and calibration are replaced by a copy of the one file of each folder, its number of events."""
-
-    def imported(root, out, config):
-        (one,) = root.iterdir()
-        out.mkdir(exist_ok=True)
-        (out / "count").write_text((one / "events_0.bin").read_text())
-
-    def calibrated(imported, out, config, about):
-        count = int((imported / "count").read_text())
-        writer = EventStore.create(out / "events.zarr", ["target"], HEIGHT, WIDTH, {})
-        writer.write("target", [slice_count(channel, 0, count) for channel in channels], DURATION_US)
-        writer.finish()
-
-    monkeypatch.setattr(inputs, "import_targets", imported)
-    monkeypatch.setattr(inputs, "calibrate_targets", calibrated)
-    config = load(project_root).recordings
-    for parent, count in (("first", 10), ("second", 20), ("first", 10)):
-        folder = tmp_path / parent / "target"
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "events_0.bin").write_text(str(count))
-        source = open_files(Files([folder], captures=config), tmp_path / "work")
-        assert sum(len(events) for piece in source.pieces for events in piece.channels) == 4 * count
-
-
 @pytest.mark.parametrize(("arguments", "reason"), [
     ((), "--sequence: expected a sequence of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
@@ -190,7 +164,7 @@ def test_a_second_folder_of_captures_of_the_same_name_gives_its_own_data(channel
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors is not there"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
-    (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
+    (("--live", "--method", "cf", "--height", 70), "--live: expected no --height"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
     (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
@@ -271,7 +245,7 @@ def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, 
     arguments = (*files, "--angles", *ANGLES, "--method", "highpass")
     assert run(*arguments, out=tmp_path / "out") == 1
     advice = re.search(
-        r"record for longer\. Networks need .*--method highpass --window (\d+us)", capsys.readouterr().err
+        r"record for longer, or give a filter, --method highpass --window (\d+us)", capsys.readouterr().err
     )
     assert advice is not None
     assert not (tmp_path / "out").exists()

@@ -20,7 +20,6 @@ from polarnet.recordings.source import (
     Source,
     chosen_part,
     header_lines,
-    sensor_size,
     unpacked,
 )
 
@@ -47,7 +46,7 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
     names = {number.decode(): name for number, name in re.findall(rb"#Source (\d+): *(\S+)", header)}
     source = chosen_part(path, choices.part, list(names), "source of events")
     camera = re.search(rb"\d{3}", names[source])
-    size = SENSORS.get(camera[0]) if camera else None
+    height, width = SENSORS.get(camera[0], (None, None)) if camera else (None, None)
 
     def blocks(counts: Counts) -> Iterator[Block]:
         for overflows, events in _packets(path, len(header), int(source), counts):
@@ -55,7 +54,7 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
             data, t = events["data"], events["t"] + (np.int64(overflows) << 31)
             yield Block(t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1)
 
-    return Source(*sensor_size(path, choices, *(size or (None, None))), blocks)
+    return Source(height, width, blocks)
 
 
 def _packets(path: Path, start: int, wanted: int, counts: Counts) -> Iterator[tuple[int, np.ndarray]]:

@@ -22,12 +22,12 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, sensor_size, start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
 
-CLOCK_MHZ = 100.0  # the vendor's default
+CLOCK_MHZ = 100  # the vendor's default
 TICK_CYCLES = 1024  # clock cycles per step of the time stamp
 
 HEADER = struct.Struct("<8B I")
@@ -55,7 +55,7 @@ class Picture(NamedTuple):
     """A full picture."""
 
     t_us: int | None
-    """The computer's time on arrival, to the millisecond; None in files without it."""
+    """The computer's time on arrival, the middle of its millisecond; None in files without it."""
     intensity: UInt16[np.ndarray, "h w"]
     """800 x 1280 pixels from a BIN file; 0 to 4095; brighter is larger."""
 
@@ -89,8 +89,6 @@ def open_bin(path: Path, choices: Choices) -> Source:
             f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
             f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
         )
-    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
-    clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
     def blocks(counts: Counts) -> Iterator[Block]:
         state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
@@ -105,14 +103,14 @@ def open_bin(path: Path, choices: Choices) -> Source:
                 events, orphans, unchanged = _decode(package[:-1], state, last_adc, columns)
                 counts.update({"orphans": orphans, "no_change": unchanged})
                 t, x, y, p = (column[:events] for column in columns)
-                yield Block(microseconds(t, clock_mhz), x, y, p)
+                yield Block(microseconds(t), x, y, p)
 
-    return Source(height, width, blocks)
+    return Source(HEIGHT, WIDTH, blocks)
 
 
-def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
+def microseconds(ticks: np.ndarray) -> np.ndarray:
     """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
-    return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
+    return np.asarray(ticks, np.int64) * TICK_CYCLES // CLOCK_MHZ
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
@@ -125,7 +123,7 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
                     f"{path.name}: expected {PICTURE_BYTES} bytes of a full picture, got {len(package)}; "
                     f"the file is damaged"
                 )
-            yield Picture(None if t_ms is None else 1000 * t_ms, _unpacked(package[:-1]))
+            yield Picture(None if t_ms is None else 1000 * t_ms + 500, _unpacked(package[:-1]))
 
 
 def matches_csv(path: Path, head: bytes) -> bool:
@@ -139,8 +137,7 @@ def matches_csv(path: Path, head: bytes) -> bool:
 def open_csv(path: Path, choices: Choices) -> Source:
     """Open a CSV file of Event Intensity mode; the other two modes have no polarity and are refused.
 
-    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
-    selects this interpretation.
+    Times are microseconds, as converters since SDK 2.0 (December 2019) write them.
     """
     lines = numbers_of(start_of(path, HEAD_BYTES))
     if lines and len(lines[0].words) != CSV_COLUMNS:
@@ -148,16 +145,15 @@ def open_csv(path: Path, choices: Choices) -> Source:
             f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
             f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
         )
-    height, width = sensor_size(path, choices, HEIGHT, WIDTH)
 
     def blocks(counts: Counts) -> Iterator[Block]:
         for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
             changed = rows[:, 3] != 0
             row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
             counts["no_change"] += len(rows) - len(t)
-            yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
+            yield Block(t, column, row, p)
 
-    return Source(height, width, blocks)
+    return Source(HEIGHT, WIDTH, blocks)
 
 
 def _unpacked(data: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from polarnet.recordings.source import (
     RecordingError,
     Source,
     chosen_part,
-    sensor_size,
 )
 
 FAERY = Library("faery", "faery", "recordings", "the file is damaged")
@@ -37,7 +36,8 @@ def open_faery(path: Path, choices: Choices, *, aedat4: bool) -> Source:
             else:
                 yield Block(*columns)
 
-    return Source(*sensor_size(path, choices, *streams[stream]), blocks)
+    height, width = streams[stream]
+    return Source(height, width, blocks)
 
 
 def aedat4_frames(path: Path) -> CameraFrames:

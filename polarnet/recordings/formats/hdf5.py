@@ -18,7 +18,6 @@ from polarnet.recordings.source import (
     RecordingError,
     Source,
     chosen_part,
-    sensor_size,
 )
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -118,8 +117,7 @@ def opener(name: str) -> Callable[[Path, Choices], Source]:
                 t = np.rint(t * 1e6) if seconds else t
                 yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
-        size = _stated_size(path, settings, settings.get(layout.resolution.format(part)))
-        return Source(*sensor_size(path, choices, *size), blocks)
+        return Source(*_stated_size(path, settings, settings.get(layout.resolution.format(part))), blocks)
 
     return open_file
 

@@ -22,7 +22,6 @@ from polarnet.recordings.source import (
     RecordingError,
     Source,
     byte_blocks,
-    sensor_size,
     start_of,
     unpacked,
 )
@@ -81,7 +80,6 @@ def open_text(path: Path, choices: Choices) -> Source:
     if not all(word.isdigit() for word in size):
         raise RecordingError(f"{path.name}: expected a first line `width height`, got {' '.join(size)!r}")
     width, height = map(int, size) if size else (None, None)
-    height, width = sensor_size(path, choices, height, width)
     order = order or COLUMNS
     decimals = [0] * len(order)
     decimals[order.index("t")] = MICROSECONDS if _in_seconds(path, start, order.index("t")) else 0

@@ -23,7 +23,6 @@ from polarnet.recordings.source import (
     RecordingError,
     Source,
     header_lines,
-    sensor_size,
     unwrapped,
     word_blocks,
 )
@@ -61,7 +60,7 @@ def open_evt(path: Path, choices: Choices) -> Source:
     version = b".".join(filter(None, stated.groups())).decode().removesuffix(".0") if stated else "none"
     if version not in EVT:
         raise RecordingError(f"{path.name}: expected a header of % lines that states EVT 2, 2.1 or 3, got {version}")
-    height, width = sensor_size(path, choices, *_evt_size(header))
+    height, width = _evt_size(header)
     legacy = version == "2.1" and _is_legacy(header)
 
     def blocks(counts: Counts) -> Iterator[Block]:
@@ -106,7 +105,6 @@ def open_dat(path: Path, choices: Choices) -> Source:
     version = stated.get(b"Version", 1)
     if version not in (1, 2):
         raise RecordingError(f"{path.name}: expected DAT of version 1 or 2, got {version}")
-    height, width = sensor_size(path, choices, stated.get(b"Height"), stated.get(b"Width"))
 
     def blocks(counts: Counts) -> Iterator[Block]:
         for t, events in unwrapped(word_blocks(path, len(header) + 2, DAT_EVENT, BLOCK_EVENTS, counts)):
@@ -116,7 +114,7 @@ def open_dat(path: Path, choices: Choices) -> Source:
             else:
                 yield Block(t, address & 0x3FFF, address >> 14 & 0x3FFF, address >> 28)
 
-    return Source(height, width, blocks)
+    return Source(stated.get(b"Height"), stated.get(b"Width"), blocks)
 
 
 def _evt_size(header: bytes) -> tuple[int | None, int | None]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
 from polarnet.recordings.formats.prophesee import evt_decoder
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part, sensor_size
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part
 from polarnet.terminal.installation import installation
 
 SUFFIXES = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3": ".db3"}
@@ -52,7 +52,7 @@ def open_rosbag(path: Path, choices: Choices) -> Source:
             )
         topic = chosen_part(path, choices.part, topics, "topic of events")
         first = next(_messages(bag, topic, Counts()), None)
-    height, width = sensor_size(path, choices, *((None, None) if first is None else first[:2]))
+    height, width = (None, None) if first is None else first[:2]
 
     def blocks(counts: Counts) -> Iterator[Block]:
         with _opened(path) as bag:

@@ -110,6 +110,7 @@ def test_lines_that_are_no_events_are_left_out_and_counted(tmp_path, read, text,
         ("0 12\n1 2 3 1\n", "expected a sensor with sides of 1 to 32767 px, got 12x0"),
         ("18 12\n1 2 3 1 7\n", "expected lines of the four columns t x y p, got 5 columns"),
         ("18 12\n" + "1 20 3 1\n" * 20, "events that are not on the sensor"),
+        ("18 12\n" + "1 2 3 1\n1 ? 3 1\n" * 20, "20 among the first 20 events: lines that are not the numbers"),
         ("18 12\n" + "1 " * 10_000, "bytes without the end of a line"),
     ],
 )
