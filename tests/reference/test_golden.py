@@ -143,7 +143,7 @@ def test_the_number_of_events_under_v2e_settings_agrees_over_seeds(golden, descr
 
 @pytest.mark.parametrize("dn", [0, 10, 20, 64, 128, 255])
 @pytest.mark.parametrize("model", ["v2e", "exact"])
-def test_shot_noise_has_the_rate_that_v2e_showed(described, model, dn):
+def test_shot_noise_has_equal_polarities_and_the_rate_that_v2e_showed(described, model, dn):
     measured = described["noise_statistics"][f"shot5_DN{dn}"]
     config = dataclasses.replace(CONFIG, model=model, shot_noise_rate_hz=5.0)
     frames = torch.full((1, 1, 64, 64), dn, dtype=torch.uint8).expand(601, -1, -1, -1)
@@ -151,3 +151,4 @@ def test_shot_noise_has_the_rate_that_v2e_showed(described, model, dn):
     error = math.sqrt(measured["model"] / (2 * 64 * 64))  # of a Poisson count over two seconds
     assert len(events) / (2 * 64 * 64) == pytest.approx(measured["model"], abs=3 * error)
     assert len(events) / (2 * 64 * 64) == pytest.approx(measured["rate_hz"], abs=3 * error)
+    assert int(events.p.sum()) == pytest.approx(0, abs=3 * math.sqrt(len(events)))

@@ -13,7 +13,7 @@ from simulation_fixtures import REST, STILL
 from polarnet.simulation.motion import Sine, SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.presets import MOTIONS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
-from polarnet.stokes import aolp, dolp, intensities_from_stokes
+from polarnet.stokes import aolp, dolp
 
 CONFIG = dataclasses.replace(MOTIONS["default"], sequences_per_picture=1, speed_min_px_s=60.0, speed_max_px_s=200.0)
 
@@ -139,18 +139,6 @@ def test_a_motion_by_whole_pixels_is_an_exact_shift(scene):
     trajectory = Trajectory(40 + 0.5, 30 + 0.5, (swing, STILL, STILL), REST, STILL, STILL, 13.0)
     first, second, *_ = render(scene, trajectory, np.arange(2.0), 20, 30)
     assert torch.equal(first[..., 8:], second[..., :-8])
-
-
-def test_intensities_of_the_interpolated_light_are_the_interpolated_intensities(scene):
-    """Equation 4 is linear in the Stokes vector: it does not matter which is interpolated."""
-    trajectory = still(20.3 + 29 / 2, 10.8 + 19 / 2)
-    behind = intensities_from_stokes(scene.stokes)
-    expected = torch.stack(
-        [render(PolarizationScene(i.expand(3, -1, -1)), trajectory, np.zeros(1), 20, 30)[0, 0] for i in behind]
-    )
-    torch.testing.assert_close(
-        intensities_from_stokes(render(scene, trajectory, np.zeros(1), 20, 30)[0]), expected, atol=1e-6, rtol=0
-    )
 
 
 def test_a_quarter_turn_of_the_camera_turns_picture_and_polarization(scene):

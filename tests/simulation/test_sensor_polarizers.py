@@ -75,15 +75,6 @@ def test_transmission_scales_a_channel_and_extinction_leaks_a_hundredth_of_it():
     assert i45 == pytest.approx(0.6 * (1 + 0.01) / 2, abs=1e-6)  # half of either
 
 
-@pytest.mark.parametrize("error_deg", [-2.0, 2.0])
-def test_polarizers_that_are_all_turned_measure_an_aolp_turned_back(error_deg):
-    for aolp in (10.0, 60.0, 150.0):
-        polarizers = dataclasses.replace(IDEAL, angle_error_deg=[error_deg] * 4)
-        dolp, angle = measured(uniform_scene(0.5, aolp), polarizers)
-        assert angle == pytest.approx(aolp - error_deg, abs=1e-3)
-        assert dolp == pytest.approx(0.5, abs=1e-5)
-
-
 def test_one_turned_polarizer_bends_s1_as_theory_says():
     """Only the polarizer at 0 degrees is turned by 2: S1 = (cos(2 AoLP - 4) + cos(2 AoLP)) / 2, S0 and S2 likewise."""
     polarizers = dataclasses.replace(IDEAL, angle_error_deg=[2.0, 0.0, 0.0, 0.0])

@@ -69,16 +69,19 @@ class Active(NamedTuple):
     events: np.ndarray  # int32, number of events so far
     fires: np.ndarray  # uint8, 1 if the pixel fires in this round
     continues: np.ndarray  # uint8, 1 if the pixel may fire in the next round
+    words: np.ndarray  # uint64, flags of the pixels of a strip
 
 
 @compiled
-def empty_active(capacity):
-    """Uninitialised arrays for up to `capacity` pixels."""
+def empty_active(batch, strip):
+    """Uninitialised arrays for up to `batch` pixels and those of another strip of `strip` pixels."""
+    capacity = batch + strip + SPARE
     d, f, events = np.empty((7, capacity)), np.empty((4, capacity), np.float32), np.empty(capacity, np.int64)
     i, b = np.empty((3, capacity), np.int32), np.empty((2, capacity), np.uint8)
     return Active(
-        i[0], i[1], d[0], d[1], d[2], d[3], d[4], d[5], d[6], events, f[0], f[1], f[2], f[3], i[2], b[0], b[1]
-    )
+        i[0], i[1], d[0], d[1], d[2], d[3], d[4], d[5], d[6], events, f[0], f[1], f[2], f[3], i[2], b[0], b[1],
+        flag_words(strip),
+    )  # fmt: skip
 
 
 @inlined

@@ -14,7 +14,7 @@ import numpy as np
 from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import active as strips
 from polarnet.simulation.pixels import physics, randomness
-from polarnet.simulation.pixels.active import SPARE, empty_active, flagged, gather, keep_continuing, scatter
+from polarnet.simulation.pixels.active import empty_active, flagged, gather, keep_continuing, scatter
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows, respond
 from polarnet.simulation.pixels.physics import (
@@ -117,8 +117,7 @@ def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = strips.rows_of_strip(h, w)
-    strip, words = np.empty((4, rows * w), np.float32), strips.flag_words(rows * w)
-    active = empty_active(BATCH + rows * w + SPARE)
+    strip, active = np.empty((4, rows * w), np.float32), empty_active(BATCH, rows * w)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     noise_key = key_for(steps.key, randomness.PHOTORECEPTOR, steps.channel)
@@ -136,6 +135,7 @@ def advance(light, pixels, steps, columns):
             first, stop = y * w, min(y + rows, h) * w
             dn, response = strip[0, : stop - first], strip[1, : stop - first]
             rise, before = strip[2, : stop - first], strip[3, : stop - first]
+            fires = strips.flags_of(active.words, stop - first)
             dn_before, response_before = pixels.dn[first:stop], pixels.response[first:stop]
             intensity_rows(light, steps.first_frame + k, y, w, dn)
             respond(dn, physics, response)
@@ -151,11 +151,10 @@ def advance(light, pixels, steps, columns):
                 wander(pixels.noise[first:stop], key, first, physics, dt_us * 1e-6, rise)
             if held_us > 0:
                 _hold(pixels.last_event_us[first:stop], pixels.leak[first:stop], step, rise)
-            fires = strips.flags_of(words, stop - first)
             _move(pixels, first, rise, np.float32(dt_us), before, fires)
             if soonest_us[y // rows] < stop_us:
                 _flag_shots(pixels.next_shot_us[first:stop], stop_us, fires)
-            count = _activate(pixels, first, before, rise, words, step, active, count)
+            count = _activate(pixels, first, before, rise, step, active, count)
             if count >= BATCH or y + rows >= h:
                 pending, n = _fire(pixels, step, active, count, w, pending, n)
                 count = ZERO
@@ -245,13 +244,13 @@ def _flag_shots(next_shot_us, stop_us, fires):
 
 
 @borrowing
-def _activate(pixels, first, before, rise, words, step, active, count):
+def _activate(pixels, first, before, rise, step, active, count):
     """Append the flagged pixels of the strip that begins at pixel `first` to the `count` active ones; returns `count`.
 
     `before` is the change at the start of the step, `rise` the rise of the filtered log intensity.
     """
     pixel, index = active.pixel[count:], active.scratch[count:]
-    stop = count + flagged(words, before.size, index, pixel)
+    stop = count + flagged(active.words, before.size, index, pixel)
     pixel, index = active.pixel[count:stop], active.scratch[count:stop]
     for a in range(stop - count):
         pixel[a] = first + index[a]

@@ -60,10 +60,12 @@ def _bilinear_row(images, row, column, dn):
 @borrowing
 def respond_8bit(dn, table, response):
     """Response to 8-bit light: rounds `dn` to whole numbers in place, then looks them up in `table_of_response`."""
+    whole = response.view(np.int32)  # two loops, because the compiler vectorises the first only without the table
     for j in range(dn.size):
-        whole = np.int32(dn[j] + np.float32(0.5)) & np.int32(255)
-        dn[j] = np.float32(whole)
-        response[j] = table[whole]
+        whole[j] = np.int32(dn[j] + np.float32(0.5)) & np.int32(255)
+        dn[j] = np.float32(whole[j])
+    for j in range(dn.size):
+        response[j] = table[np.uint64(whole[j])]
 
 
 @compiled

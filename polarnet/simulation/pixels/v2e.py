@@ -20,6 +20,9 @@ from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals,
 EIGHT_BIT_VIDEO = True
 OPTIONS: tuple[str, ...] = ("dark_dn", "photoreceptor_noise")
 NEARLY = np.float32(1.000001)  # enlarges changes by more than rounding in a first test; `_count` then counts exactly
+PIXEL, EVENT, CROSSED, ACCEPTED = range(4)
+"""Columns of the list of firing pixels: index, place and polarity as `columns.event_of` encodes them, crossed
+thresholds and accepted events, the last two negative for OFF."""
 
 physics_of = physics.physics_of
 
@@ -42,13 +45,32 @@ class Step(NamedTuple):
     """One step of a channel."""
 
     physics: Physics
+    width: int
+    frame: int  # index into the light of the frame at its end
     start_us: float
     stop_us: float
-    duration_s: float
     leak_key: np.uint64
     shot_key: np.uint64
     max_shot_share: float
     """Upper bound of a pixel's shot-noise rate in the dark, relative to the nominal rate of one polarity."""
+
+
+class Firing(NamedTuple):
+    """Pixels that fire in a step, and scratch to find and list them."""
+
+    entries: np.ndarray  # int32 [h * w + 1, 4], a row per pixel: PIXEL, EVENT, CROSSED, ACCEPTED
+    order: np.ndarray  # int32, working memory: indices of the entries with events left
+    words: np.ndarray  # uint64, flags of a strip
+    candidates: np.ndarray  # int32 [2, pixels of a strip + SPARE], scratch
+
+
+class Slot(NamedTuple):
+    """One of the times at which pixels fire within a step."""
+
+    number: int  # from 1
+    event: np.int64  # its time, as `columns.event_of` encodes it
+    stamp: np.float32  # the same time in seconds
+    least_s: np.float32  # a pixel fires if its last event is longer ago; -infinity if none can be suppressed
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
@@ -64,19 +86,19 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
 
 
 @borrowing
-def _respond(light, frame, y, w, physics, table, dn, response):
-    intensity_rows(light, frame, y, w, dn)
-    if light.images.itemsize == 1 or (light.top.size and physics.dark_dn == 0):  # a scene that an 8-bit video shows
-        respond_8bit(dn, table, response)
+def _respond(light, steps, frame, y, table, dn, response):
+    intensity_rows(light, frame, y, steps.width, dn)
+    if light.images.itemsize == 1 or (light.top.size and steps.physics.dark_dn == 0):
+        respond_8bit(dn, table, response)  # bytes, or a scene that an 8-bit video shows
     else:
-        respond_as_v2e(dn, physics, response)
+        respond_as_v2e(dn, steps.physics, response)
 
 
 @compiled
 def start(light, pixels, steps):
     """Set low-pass and memory to the first frame; nothing fires."""
     dn, response = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
-    _respond(light, ZERO, ZERO, steps.width, steps.physics, table_of_response(steps.physics), dn, response)
+    _respond(light, steps, ZERO, ZERO, table_of_response(steps.physics), dn, response)
     pixels.filtered[:] = pixels.memory[:] = response
     if pixels.photoreceptor.size:
         pixels.photoreceptor[:] = response
@@ -86,11 +108,12 @@ def start(light, pixels, steps):
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    physics, times_us, w, size = steps.physics, steps.times_us, steps.width, steps.height * steps.width
-    (dn, response), noise = np.empty((2, w), np.float32), np.empty(size, np.float32)
-    table, words, (candidates, groups) = table_of_response(physics), flag_words(w), np.empty((2, w + SPARE), np.int32)
-    firing, crossed = np.empty((2, size + 1), np.int32)
-    pending = np.empty(size, np.int64)
+    physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
+    rows = rows_of_strip(h, w)
+    strip, table = np.empty((3, rows * w), np.float32), table_of_response(physics)
+    entries, order = np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32)
+    firing = Firing(entries, order, flag_words(rows * w), np.empty((2, rows * w + SPARE), np.int32))
+    pending = np.empty(h * w, np.int64)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     noise_key = key_for(steps.key, randomness.PHOTORECEPTOR, steps.channel)
@@ -98,21 +121,18 @@ def advance(light, pixels, steps, columns):
     max_share = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
     used = ZERO
     for k in range(times_us.size - 1):
-        number, frame = steps.first_number + k, steps.first_frame + k
-        dt = (times_us[k + 1] - times_us[k]) * 1e-6
+        number, frame, dt = steps.first_number + k, steps.first_frame + k, (times_us[k + 1] - times_us[k]) * 1e-6
         keys = mixed(leak_key, number), mixed(shot_key, number)
-        step = Step(physics, times_us[k], times_us[k + 1], dt, keys[0], keys[1], max_share)
-        if physics.leak_rate_hz > 0:
-            strip = rows_of_strip(steps.height, w) * w  # each with numbers of its own
-            for first in range(0, size, strip):
-                rough_normals(step.leak_key, first, noise[first : first + strip])
-        n, most = ZERO, ZERO
-        for y in range(steps.height):
-            row = slice(y * w, (y + 1) * w)
-            filtered, memory = pixels.filtered[row], pixels.memory[row]
-            _respond(light, frame, y, w, physics, table, dn, response)
+        step = Step(physics, w, frame, times_us[k], times_us[k + 1], keys[0], keys[1], max_share)
+        count = ZERO
+        for y in range(0, h, rows):
+            first, stop = y * w, min(y + rows, h) * w
+            part = slice(first, stop)
+            dn, response, noise = strip[0, : stop - first], strip[1, : stop - first], strip[2, : stop - first]
+            filtered, memory, threshold_on = pixels.filtered[part], pixels.memory[part], pixels.threshold_on[part]
+            _respond(light, steps, frame, y, table, dn, response)
             if physics.source_follower_hz > 0:
-                photoreceptor = pixels.photoreceptor[row]
+                photoreceptor = pixels.photoreceptor[part]
                 if physics.cutoff_hz > 0:
                     _filter(response, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
                 else:
@@ -123,16 +143,16 @@ def advance(light, pixels, steps, columns):
             else:
                 filtered[:] = response
             if physics.photoreceptor_noise > 0:
-                wander(pixels.noise[row], mixed(noise_key, number), y * w, physics, dt, response)
-                output[row] = filtered + pixels.noise[row]
+                wander(pixels.noise[part], mixed(noise_key, number), first, physics, dt, response)
+                output[part] = filtered + pixels.noise[part]
             if physics.leak_rate_hz > 0:
-                _leak(memory, pixels.threshold_on[row], pixels.leak_factor[row], noise[row], dt, physics)
-            _flag(output[row], memory, pixels.threshold_on[row], pixels.threshold_off[row], flags_of(words, w))
-            count = flagged(words, w, candidates, groups)
-            n, most = _count(pixels, output, physics, y * w, candidates[:count], firing, crossed, n, most)
-        pending, n = _emit(pixels, step, w, firing[:n], crossed, most, pending)
+                rough_normals(step.leak_key, first, noise)
+                _leak(memory, threshold_on, pixels.leak_factor[part], noise, dt, physics)
+            _flag(output[part], memory, threshold_on, pixels.threshold_off[part], flags_of(firing.words, stop - first))
+            count = _count(pixels, output, steps, first, stop, firing, count)
+        pending, n = _emit(pixels, step, firing, count, pending)
         if physics.shot_noise_rate_hz > 0:
-            pending, n = _emit_shots(light, frame, pixels, output, step, w, pending, n)
+            pending, n = _emit_shots(light, pixels, output, step, pending, n)
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
@@ -170,78 +190,103 @@ def _flag(filtered, memory, threshold_on, threshold_off, fires):
 
 
 @borrowing
-def _count(pixels, output, physics, first, candidates, firing, crossed, n, most):
-    """List the candidates of the row from pixel `first` on that cross thresholds, and how many (negative for OFF).
-
-    `n` is the length of the list, `most` the largest number of crossings so far; returns both.
-    """
+def _count(pixels, output, steps, first, stop, firing, n):
+    """Append the flagged pixels from `first` up to `stop` that cross a threshold to the n listed ones; returns n."""
+    physics, w, entries, candidates = steps.physics, steps.width, firing.entries, firing.candidates
+    count = flagged(firing.words, stop - first, candidates[0], candidates[1])
+    y, row_start = first // w, first
     double = pixels.memory.itemsize == 8  # v2e divides float64 by a Python float where all pixels have one threshold
-    for x in candidates:
-        i = first + x
+    for c in range(count):
+        i, entry = np.uint64(first + candidates[0, c]), np.uint64(n)  # unsigned: numba checks others for being negative
+        while first + candidates[0, c] >= row_start + w:
+            y, row_start = y + 1, row_start + w
         change = np.float64(output[i] - pixels.memory[i])
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
         if double and physics.threshold_sigma_on == 0 and physics.threshold_mismatch_on == 0:
             on = physics.threshold_on
         if double and physics.threshold_sigma_off == 0 and physics.threshold_mismatch_off == 0:
             off = physics.threshold_off
-        firing[n], crossed[n] = i, np.int32(change / (on if change > 0 else off))
-        most = max(most, abs(crossed[n]))
-        n += crossed[n] != 0
-    return n, most
+        crossed = np.int32(change / (on if change > 0 else off))
+        event = place_of(y, first + candidates[0, c] - row_start) | np.int64(crossed > 0)
+        entries[entry, PIXEL], entries[entry, EVENT] = i, event
+        entries[entry, CROSSED], entries[entry, ACCEPTED] = crossed, 0
+        n += crossed != 0
+    return n
 
 
 @compiled
-def _emit(pixels, step, width, firing, crossed, most, pending):
-    """Pending events of one step and their number: the busiest pixel of the channel sets the number of slots for all.
+def _emit(pixels, step, firing, count, pending):
+    """Pending events of one step in the order of its slots, and their number.
 
-    An event within the refractory period of its pixel is suppressed; its change of light can fire in the next step.
+    The busiest pixel of the channel sets the number of slots for all. An event within the refractory period of its
+    pixel is suppressed; its change of light can fire in the next step.
     """
-    start_us, stop_us, refractory_s = step.start_us, step.stop_us, step.physics.refractory_s
-    least = np.float32(refractory_s) if refractory_s > (stop_us - start_us) * 1e-6 / max(most, 1) else np.float32(-1)
-    offsets_us, stamps = _slots(start_us, stop_us, most)
-    n = 0
-    for a in range(firing.size):
-        i, on, accepted = firing[a], crossed[a] > 0, 0
-        place = place_of(i // width, i % width)
-        while n + abs(crossed[a]) > pending.size:
-            pending = roomier(pending)
-        for slot in range(abs(crossed[a])):
-            if least < 0 or np.float32(stamps[slot] - pixels.refractory_since[i]) > least:
-                pending[n] = event_of(offsets_us[slot], place, on)
-                n, accepted = n + 1, accepted + 1
-                if least >= 0:
-                    pixels.refractory_since[i] = stamps[slot]
-        # the remainder of the change is kept
-        threshold = pixels.threshold_on[i] if on else -pixels.threshold_off[i]
-        pixels.memory[i] += threshold * np.float32(accepted)
-    return pending, n
-
-
-@compiled
-def _slots(start_us, stop_us, most):
-    """Times of a step's slots in whole microseconds since its start, and in seconds as v2e's float32 stamps."""
-    offsets_us, stamps = np.empty(most, np.int64), np.empty(most, np.float32)
+    physics, start_us, stop_us, most = step.physics, step.start_us, step.stop_us, 0
+    for a in range(count):
+        most, firing.order[a] = max(most, abs(firing.entries[a, CROSSED])), a
+    refractory = physics.refractory_s > (stop_us - start_us) * 1e-6 / max(most, 1)
+    least_s = np.float32(physics.refractory_s) if refractory else np.float32(-np.inf)
     first = np.float32((start_us + (stop_us - start_us) / max(most, 1)) * 1e-6)
     last = np.float32(stop_us * 1e-6)
     interval = np.float32((last - first) / np.float32(max(most - 1, 1)))
-    for slot in range(most):
-        time_us = start_us + (stop_us - start_us) * (slot + 1) / most
-        offsets_us[slot] = np.int64(np.rint(time_us)) - np.int64(math.floor(start_us))
+    n, active = ZERO, np.int64(count)
+    for number in range(1, most + 1):
+        offset_us = np.int64(np.rint(start_us + (stop_us - start_us) * number / most)) - np.int64(math.floor(start_us))
         # torch.linspace, which v2e calls, counts from both ends
-        early = slot < most // 2
-        stamps[slot] = first + interval * np.float32(slot) if early else last - interval * np.float32(most - 1 - slot)
-    return offsets_us, stamps
+        early = number <= most // 2
+        stamp = first + interval * np.float32(number - 1) if early else last - interval * np.float32(most - number)
+        while n + active >= pending.size:
+            pending = roomier(pending)
+        written, active = _emit_slot(
+            pixels, firing, active, Slot(number, event_of(offset_us, 0, 0), stamp, least_s), pending[n:]
+        )
+        n += written
+    _consume(pixels, firing.entries, count)
+    return pending, n
+
+
+@borrowing
+def _emit_slot(pixels, firing, active, slot, pending):
+    """Write the events of a slot into `pending`; returns their number, and that of pixels with events left.
+
+    There is room for one event more than active pixels.
+    """
+    refractory = slot.least_s >= np.float32(0)
+    entries, order, since = firing.entries, firing.order, pixels.refractory_since
+    written, remaining = 0, 0
+    for a in range(active):  # without branches: an event that is suppressed is overwritten by the next
+        e = np.uint64(order[a])
+        i, crossed = np.uint64(entries[e, PIXEL]), entries[e, CROSSED]
+        accepted = np.float32(slot.stamp - since[i]) > slot.least_s
+        if refractory:
+            since[i] = slot.stamp if accepted else since[i]
+        pending[np.uint64(written)] = slot.event | entries[e, EVENT]
+        polarity = np.int32(1) if crossed > 0 else np.int32(-1)
+        entries[e, ACCEPTED] += polarity if accepted else np.int32(0)
+        written += int(accepted)
+        order[np.uint64(remaining)] = e
+        remaining += abs(crossed) > slot.number
+    return written, remaining
+
+
+@borrowing
+def _consume(pixels, entries, count):
+    """Move each memory by the thresholds whose events were accepted; the remainder of the change is kept."""
+    for a in range(count):
+        i, accepted = np.uint64(entries[a, PIXEL]), entries[a, ACCEPTED]
+        on, off = pixels.threshold_on[i], pixels.threshold_off[i]
+        pixels.memory[i] += (on if accepted > 0 else off) * np.float32(accepted)
 
 
 @compiled
-def _emit_shots(light, frame, pixels, output, step, w, pending, n):
+def _emit_shots(light, pixels, output, step, pending, n):
     """Append the shot noise of one step to the n pending events: each pixel's probability to fire falls with light.
 
     Geometric skipping finds the pixels that would fire in the dark at the channel's lowest thresholds. The draw
     at the pixel's own light and thresholds then keeps a part of them.
     """
-    physics, key, pixel_count = step.physics, step.shot_key, pixels.memory.size
-    half_rate = physics.shot_noise_rate_hz / 2 * step.duration_s
+    physics, key, w, pixel_count = step.physics, step.shot_key, step.width, pixels.memory.size
+    half_rate = physics.shot_noise_rate_hz / 2 * ((step.stop_us - step.start_us) * 1e-6)
     ceiling = min(step.max_shot_share * half_rate, 1.0)
     dn = np.empty(w, np.float32)
     row, i, draw = -1, -1, 0
@@ -253,7 +298,7 @@ def _emit_shots(light, frame, pixels, output, step, w, pending, n):
         i += 1 + int(gap)
         if i // w != row:
             row = i // w
-            intensity_rows(light, frame, row, w, dn)
+            intensity_rows(light, step.frame, row, w, dn)
         chance = half_rate * shot_noise_fraction(dn[i - row * w])
         on = chance * physics.threshold_on / pixels.threshold_on[i]
         off = chance * physics.threshold_off / pixels.threshold_off[i]

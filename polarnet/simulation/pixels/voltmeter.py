@@ -71,23 +71,23 @@ def start(light, pixels, steps):
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    times_us, h, w = steps.times_us, steps.height, steps.width
-    passage_key, used, dn = key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), ZERO, np.empty(w, np.float32)
-    pending = np.empty(h * w, np.int64)
-    for k in range(times_us.size - 1):
-        n, key = ZERO, mixed(passage_key, steps.first_number + k)
+    h, w, used = steps.height, steps.width, ZERO
+    dn, pending = np.empty(w, np.float32), np.empty(h * w, np.int64)
+    for k in range(steps.times_us.size - 1):
+        n = ZERO
         for y in range(h):
             intensity_rows(light, steps.first_frame + k, y, w, dn)
-            pending, n = _walk(pixels, steps, k, key, y, dn, pending, n)
+            pending, n = _walk(pixels, steps, k, y, dn, pending, n)
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 
 @compiled
-def _walk(pixels, steps, k, key, y, dn, pending, n):
+def _walk(pixels, steps, k, y, dn, pending, n):
     """Move the voltages of row y from threshold to threshold through step k; return the pending events and number."""
     physics, start_us, dt = steps.physics, steps.times_us[k], steps.times_us[k + 1] - steps.times_us[k]
     base_us = math.floor(start_us)
+    key = mixed(key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), steps.first_number + k)
     for x in range(dn.size):
         i = y * dn.size + x
         before, after = np.float64(pixels.dn[i]), np.float64(dn[x])
