@@ -130,7 +130,7 @@ def contexts_of(
 
 
 def scored_sequence(
-    scenes: SceneStore, config: Config, contexts: Mapping[str, Context], name: str, constant: float
+    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
