@@ -32,8 +32,8 @@ NAMES = {"randomise": {"model": ["exact", "v2e"], "contrast_threshold_mismatch_o
     ({}, {}, RANGE, None),
     ({}, {"cutoff_hz": 400.0}, RANGE, "emulate.cutoff_hz 400.0 (training: [30.0, 300.0])."),
     ({}, {"contrast_threshold_mismatch_on": 0.15}, NAMES, None),
-    ({}, {"model": "esim"}, NAMES, 'emulate.model "esim" (training: ["exact", "v2e"]), '
-     "emulate.contrast_threshold_mismatch_on null (training: [0.1, 0.2])."),
+    ({}, {"model": "esim"}, NAMES, "emulate.contrast_threshold_mismatch_on null (training: [0.1, 0.2]), "
+     'emulate.model "esim" (training: ["exact", "v2e"]).'),
     ({}, RANGE, RANGE, None),
     ({}, RANGE, {}, 'emulate.randomise {"cutoff_hz": [30.0, 300.0]} (training: null).'),
 ])  # fmt: skip
