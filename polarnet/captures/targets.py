@@ -146,10 +146,9 @@ def calibrate_targets(
     source = EventStore.open(imported / "events.zarr")
     names, (height, width) = source.sequences, config.size
     start_over(out, enabled=True)
-    frames_max = len(frame_times_us(max(source.duration_us(name) for name in names), config))
     events = EventStore.create(out / "events.zarr", names, height, width, about)
     contents = Contents(dict.fromkeys(names, "test"), about)
-    frames = FrameStore.create(out / "frames.zarr", contents, frames_max, height, width)
+    frames = FrameStore.create(out / "frames.zarr", contents, height, width)
     targets = []
     for name in names:
         target = open_target(imported, name)
