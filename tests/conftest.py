@@ -162,11 +162,10 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         folder / "scenes.zarr",
         Contents(splits, {"layout": "four_sensors"}, sequences_per_part=2),
         {name: name[0] for name in splits},
-        largest_picture=(60, 80),
-        sensor=window,
-        trajectory_names=Trajectory.vector_names(),
+        window,
+        Trajectory.vector_names(),
     )
-    frames = FrameStore.create(folder / "frames.zarr", Contents(splits), len(t_us), *window)
+    frames = FrameStore.create(folder / "frames.zarr", Contents(splits), *window)
     for number, name in enumerate(scenes.sequences):
         generator = np.random.default_rng(number)
         coarse = torch.from_numpy(generator.random((1, 3, 12, 16), dtype=np.float32))

@@ -139,10 +139,8 @@ def _write(folder: Path, recordings: Sequence[Recorded]) -> None:
     names = [one.name for one in recordings]
     height, width = recordings[0].truth.dolp.shape[1:]
     events = EventStore.create(folder / "events.zarr", names, height, width, {})
-    most = max(len(one.truth.t_us) for one in recordings)
-    frames = FrameStore.create(
-        folder / "frames.zarr", Contents(dict.fromkeys(names, "test"), masked=True), most, height, width
-    )
+    contents = Contents(dict.fromkeys(names, "test"), masked=True)
+    frames = FrameStore.create(folder / "frames.zarr", contents, height, width)
     for name, channels, truth, _ in recordings:
         events.write(name, channels, int(truth.t_us[-1]))
         frames.write(name, truth.t_us, truth.intensity.clamp(0, 1), truth.dolp, truth.aolp, truth.valid)

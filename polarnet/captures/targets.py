@@ -100,10 +100,9 @@ def calibrate_targets(root: Path, out: Path, config: RecordingsConfig, about: Ma
         find_captures(root / name)  # a missing file is reported before hours of decoding
     start_over(out, enabled=True)
     height, width = config.size
-    frames_max = len(frame_times_us(round(1e6 * (config.duration_s or MAX_DURATION_S)), config))
     events = EventStore.create(out / "events.zarr", names, height, width, about)
     contents = Contents(dict.fromkeys(names, "test"), about)
-    frames = FrameStore.create(out / "frames.zarr", contents, frames_max, height, width)
+    frames = FrameStore.create(out / "frames.zarr", contents, height, width)
     targets = []
     for name in names:
         target = read_target(root / name, config)

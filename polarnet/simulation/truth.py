@@ -157,14 +157,10 @@ def _create(
         attributes["crosstalk"] = crosstalk
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
-    largest = max(entry.height for entry in entries), max(entry.width for entry in entries)
-    names = Trajectory.vector_names()
-    scene_store = SceneStore.create(
-        scenes, contents, scene_of, largest_picture=largest, sensor=sensor, trajectory_names=names
-    )
+    scene_store = SceneStore.create(scenes, contents, scene_of, sensor, Trajectory.vector_names())
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
     size = channel_size(synthesis.polarizers.layout, *sensor)
-    frame_store = FrameStore.create(frames, contents, len(frame_times_us(config)), *size)
+    frame_store = FrameStore.create(frames, contents, *size)
     return scene_store, frame_store
 
 

@@ -13,20 +13,15 @@ from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
-from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer
+from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG
 from polarnet.storage.groups import REPAIR
-from polarnet.storage.parts import Header, Store
+from polarnet.storage.parts import Store
 
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
-CHUNK = (
-    2**18
-)  # events compressed together; smaller chunks make Zarr slower, for a window as well as for a whole sequence
 INDEX_STEP = 2**14  # events
 COLUMNS = {"t": "uint32", "x": "uint16", "y": "uint16", "p": "int8"}
 
 ANALYZER = "analyzer"
-IDEAL_ANALYZER = torch.from_numpy(analyzer(np.radians(POLARIZER_ANGLES_DEG)).T.astype(np.float32))
-"""That of simulated sequences for which none is stored."""
 
 CONVENTIONS = {
     "layout": "a sequence's channels one after the other, from offsets[c] up to offsets[c + 1] of its rows",
@@ -53,7 +48,7 @@ class EventStore(Store):
 
     FORMAT = "polarnet.events"
     VERSION = 5
-    chunk = CHUNK
+    chunk = 2**18  # events; smaller chunks make Zarr slower, for a window as well as for a whole sequence
     height: Annotated[PositiveInt, Field(le=MAX_SIDE)]
     width: Annotated[PositiveInt, Field(le=MAX_SIDE)]
 
@@ -101,7 +96,7 @@ class EventStore(Store):
         for name, dtype in COLUMNS.items():  # narrower types, which hold every value that `_check` accepts
             pieces = [getattr(channel, name).numpy() for channel in channels]
             columns[name] = np.concatenate(pieces, dtype=dtype, casting="unsafe")
-        record = {
+        record: dict[str, Any] = {
             "offsets": np.cumsum([0, *map(len, channels)]).tolist(),
             "duration_us": int(duration_us),
             "index": [channel.t[::INDEX_STEP].tolist() for channel in channels],
@@ -109,10 +104,10 @@ class EventStore(Store):
         record |= {"drawn": dict(drawn)} if drawn else {}
         maps = {}
         if analyzer is not None and analyzer.ndim > 2:
-            maps = {ANALYZER: analyzer.numpy()}
-        elif analyzer is not None and not torch.equal(analyzer, IDEAL_ANALYZER):
+            record["maps"], maps = [ANALYZER], {ANALYZER: analyzer.numpy()}
+        elif analyzer is not None:
             record[ANALYZER] = analyzer.tolist()
-        self.append(sequence, columns, record | ({"maps": list(maps)} if maps else {}), maps)
+        self.append(sequence, columns, record, maps)
 
     def analyzer(self, sequence: str) -> Float32[Tensor, "4 3 *pixels"] | None:
         """Weights a0, a1, a2 of each channel's pixels: the light behind one is a0 S0 + a1 S1 + a2 S2.
@@ -123,10 +118,7 @@ class EventStore(Store):
         record = self.record(sequence)
         if ANALYZER in record.get("maps", ()):
             return torch.from_numpy(self.read_array(f"{ANALYZER}/{sequence}", sequence))
-        if ANALYZER in record:
-            return torch.tensor(record[ANALYZER])
-        ideal = "polarizers" in self.attributes and "rotating" not in self.attributes
-        return IDEAL_ANALYZER.clone() if ideal else None
+        return torch.tensor(record[ANALYZER]) if ANALYZER in record else None
 
     def duration_us(self, sequence: str) -> int:
         """Length of a sequence in microseconds."""
@@ -176,33 +168,19 @@ class EventStore(Store):
         except ValueError as error:
             raise ValueError(f"{self.path}: {sequence}: {error}; {REPAIR}") from None
 
-    def check_record(self, sequence: str, record: Header) -> None:
-        """ValueError for a record that no writer makes, such as a duration above 71 minutes."""
-        super().check_record(sequence, record)
-        offsets, (start, stop), duration_us = record["offsets"], record["rows"], record["duration_us"]
-        spans = len(offsets) == NUM_CHANNELS + 1 and offsets == sorted([0, *offsets[1:-1], stop - start])
-        steps = [-(-int(count) // INDEX_STEP) for count in np.diff(offsets)]
-        if not (spans and [*map(len, record["index"])] == steps and 0 < duration_us <= MAX_DURATION_US):
-            raise ValueError(
-                f"{sequence}: expected offsets of {stop - start} events, got {offsets} in {duration_us} us"
-            )
-
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != NUM_CHANNELS:
             raise ValueError(f"expected a channel for each of {NUM_CHANNELS} polarizers, got {len(channels)}")
         if not 0 < duration_us <= MAX_DURATION_US:
             raise ValueError(f"expected a duration of 1 to {MAX_DURATION_US} us, got {duration_us}; cut the sequence")
         for angle, channel in zip(POLARIZER_ANGLES_DEG, channels, strict=True):
+            size = f"{channel.height}x{channel.width}"
+            if size != f"{self.height}x{self.width}":
+                raise ValueError(f"polarizer {angle}: expected a sensor of {self.height}x{self.width} px, got {size}")
             try:
-                self._check_channel(channel, duration_us)
+                validate(channel)
             except ValueError as error:
                 raise ValueError(f"polarizer {angle}: {error}") from None
-
-    def _check_channel(self, channel: Events, duration_us: int) -> None:
-        size = f"{channel.height}x{channel.width}"
-        if size != f"{self.height}x{self.width}":
-            raise ValueError(f"expected a sensor of {self.height}x{self.width} px, got {size}")
-        validate(channel)
-        if len(channel) and not (channel.t[0] >= 0 and channel.t[-1] <= duration_us):
-            times = f"{int(channel.t[0])} to {int(channel.t[-1])} us"
-            raise ValueError(f"expected times from 0 to the duration of {duration_us} us, got {times}")
+            if len(channel) and not 0 <= (first := int(channel.t[0])) <= (last := int(channel.t[-1])) <= duration_us:
+                times = f"times from 0 to the duration of {duration_us} us, got {first} to {last} us"
+                raise ValueError(f"polarizer {angle}: expected {times}")

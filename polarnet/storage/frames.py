@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64, Integer, UInt16
+from jaxtyping import Bool, Float, Int64, Integer, Shaped, UInt16
 from pydantic import PositiveInt
 from torch import Tensor
 
@@ -26,7 +26,7 @@ CONVENTIONS = {
     "intensity": "behind polarizers at 0, 45, 90 and 135 degrees (third axis), with I0 + I90 = S0: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
-    "valid": "whether the truth of a pixel is known, 8 pixels of a row a byte, the leftmost in the highest bit",
+    "valid": "whether the truth of a pixel is known",
 }
 
 
@@ -66,8 +66,10 @@ def quantise(name: str, values: Float[Array, "*shape"], axes: str = "...") -> UI
     return ((angles * (ANGLE_STEPS / math.pi)).round().numpy().astype(np.int64) % ANGLE_STEPS).astype(np.uint16)
 
 
-def dequantise(name: str, steps: UInt16[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Invert `quantise`."""
+def dequantise(name: str, steps: Shaped[np.ndarray, "*shape"]) -> Shaped[Tensor, "*shape"]:
+    """Invert `quantise`; a mask `valid` stays as it is."""
+    if name == "valid":
+        return torch.from_numpy(steps)
     values = torch.from_numpy(steps.astype(np.float32))
     return values.mul_(math.pi / ANGLE_STEPS) if name == "aolp" else values.div_(FRACTION_STEPS)
 
@@ -109,13 +111,15 @@ class SplitStore(Store):
         """The original picture of a sequence or variant; the sequence itself if the store names no pictures."""
         return self.variant_of.get(sequence) or self.attributes.get("scenes", {}).get(sequence, sequence)
 
-    def checked_mask(self, valid: Bool[Array, "*shape"] | None, shape: Sequence[int]) -> Bool[np.ndarray, "*shape"]:
-        """The mask, all pixels valid if it is None; ValueError for another shape, or a mask for a store without one."""
-        if valid is None:
-            return np.ones(tuple(shape), bool)
-        if not self.masked:
+    def mask_column(self, valid: Bool[Array, "*shape"] | None, shape: Sequence[int]) -> dict[str, np.ndarray]:
+        """The column `valid` of a masked store, True everywhere if the mask is None; no column in another store.
+
+        ValueError for a mask of another shape, or for a store without one.
+        """
+        if valid is not None and not self.masked:
             raise ValueError(f"{self.path}: got a mask for a store without one; create it with masked=True")
-        return mask_of("valid", valid, shape).cpu().numpy()
+        known = np.ones(tuple(shape), bool) if valid is None else mask_of("valid", valid, shape).cpu().numpy()
+        return {"valid": known} if self.masked else {}
 
 
 class FrameStore(SplitStore):
@@ -123,7 +127,7 @@ class FrameStore(SplitStore):
 
     >>> import torch
     >>> from polarnet.storage import Contents, FrameStore
-    >>> store = FrameStore.create("frames.zarr", Contents({"lake": "test"}), n_frames=1, height=12, width=18)
+    >>> store = FrameStore.create("frames.zarr", Contents({"lake": "test"}), height=12, width=18)
     >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
     >>> store.finish()
     >>> FrameStore.open("frames.zarr").of_split("test")
@@ -131,24 +135,17 @@ class FrameStore(SplitStore):
     """
 
     FORMAT = "polarnet.frames"
-    VERSION = 6
-    n_frames: PositiveInt
-    """Maximum number of frames of a sequence."""
+    VERSION = 7
+    chunk = FRAMES_PER_CHUNK
     height: PositiveInt
     width: PositiveInt
 
-    @property
-    def chunk(self) -> int:
-        """Frames that are compressed together."""
-        return min(self.n_frames, FRAMES_PER_CHUNK)
-
     @classmethod
-    def create(
-        cls, path: str | os.PathLike[str], contents: Contents, n_frames: int, height: int, width: int
-    ) -> "FrameStore":
-        """Create a store for up to `n_frames` per sequence, or resume it; see `Store.create_parts`."""
-        size: dict[str, Any] = {"n_frames": n_frames, "height": height, "width": width}
-        return cls.create_parts(path, list(contents.splits), **vars(contents), **size, conventions=CONVENTIONS)
+    def create(cls, path: str | os.PathLike[str], contents: Contents, height: int, width: int) -> "FrameStore":
+        """Create a store to write, or resume it; see `Store.create_parts`."""
+        return cls.create_parts(
+            path, list(contents.splits), **vars(contents), height=height, width=width, conventions=CONVENTIONS
+        )
 
     def write(
         self,
@@ -166,16 +163,12 @@ class FrameStore(SplitStore):
         of None marks all pixels valid.
         """
         times = whole_numbers("t_us", t_us)
-        if times.ndim != 1 or not 0 < len(times) <= self.n_frames or (times < 0).any() or (times.diff() <= 0).any():
-            raise ValueError(
-                f"expected 1 to {self.n_frames} frame times, increasing from 0 or later, got {times.tolist()[:40]}"
-            )
+        if times.ndim != 1 or not len(times) or (times < 0).any() or (times.diff() <= 0).any():
+            raise ValueError(f"expected frame times that increase from 0 or later, got {times.tolist()[:40]}")
         columns = {}
         for name, values, channels in (("intensity", intensity, "4 "), ("dolp", dolp, ""), ("aolp", aolp, "")):
             columns[name] = quantise(name, values, f"{len(times)} {channels}{self.height} {self.width}")
-        known = self.checked_mask(valid, dolp.shape)
-        if self.masked:
-            columns["valid"] = np.packbits(known, axis=-1)
+        columns |= self.mask_column(valid, dolp.shape)
         self.append(sequence, columns, {"t_us": times.tolist()})
 
     def t_us(self, sequence: str) -> Int64[Tensor, " n"]:
@@ -184,16 +177,11 @@ class FrameStore(SplitStore):
 
     def quantity(self, name: str, sequence: str) -> Tensor:
         """`intensity`, `dolp`, `aolp` or, in a masked store, `valid` of all frames of a sequence, as in `Frames`."""
-        return self._values(name, self.read_column(name, sequence))
+        return dequantise(name, self.read_column(name, sequence))
 
     def frames(self, sequence: str, start: int = 0, stop: int | None = None) -> Frames:
         """Frames of a sequence from number `start` up to `stop` (None: the end)."""
         names = ["intensity", "dolp", "aolp", *["valid"] * self.masked]
         (columns,) = self.read_columns(sequence, names, [(start, stop)])
-        values = {name: self._values(name, rows) for name, rows in columns.items()}
+        values = {name: dequantise(name, rows) for name, rows in columns.items()}
         return Frames(self.t_us(sequence)[start:stop], **values)
-
-    def _values(self, name: str, rows: np.ndarray) -> Tensor:
-        if name == "valid":
-            return torch.from_numpy(np.unpackbits(rows, axis=-1, count=self.width).astype(bool))
-        return dequantise(name, rows)

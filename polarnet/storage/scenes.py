@@ -5,12 +5,10 @@ Rendering starts from the stored, quantised scene, so that truth and events agre
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Annotated
 
 import numpy as np
-import torch
 from jaxtyping import Float64
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt
 
 from polarnet.runtime.arrays import Array, as_tensor, check_same_shape
 from polarnet.storage.frames import Contents, Polarization, SplitStore, dequantise, quantise
@@ -20,7 +18,7 @@ CONVENTIONS = {
     "s0": "intensity of a scene, row by row: value / 65535",
     "dolp": "degree of linear polarization: value / 65535",
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
-    "valid": "1 where the light of a pixel is known, 0 where saturation hid it",
+    "valid": "whether the light of a pixel is known; saturation hides it",
     "picture_size": "height and width of a scene in pixels",
     "trajectory": "how the sensor moves in a sequence: numbers named by the attribute trajectory_names",
     "duration_us": "length of a sequence in microseconds",
@@ -34,8 +32,7 @@ class SceneStore(SplitStore):
     >>> import torch
     >>> from polarnet.storage import Contents, SceneStore
     >>> from polarnet.storage.frames import Polarization
-    >>> sizes = {"largest_picture": (12, 18), "sensor": (6, 9), "trajectory_names": ["x"]}
-    >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, **sizes)
+    >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, (6, 9), ["x"])
     >>> store.write("lake-00", Polarization(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
     >>> store.finish()
     >>> SceneStore.open("scenes.zarr").read("lake-00").s0.shape
@@ -43,12 +40,10 @@ class SceneStore(SplitStore):
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 6
+    VERSION = 7
     chunk = 2**18  # pixels
     scene_of: dict[str, str]
     """Name of the scene of each sequence; several sequences may show one."""
-    largest_picture: Annotated[list[PositiveInt], Field(min_length=2, max_length=2)]
-    """Height and width that no scene exceeds, pixels."""
     sensor_height: PositiveInt
     sensor_width: PositiveInt
     trajectory_names: list[str]
@@ -59,15 +54,13 @@ class SceneStore(SplitStore):
         path: str | os.PathLike[str],
         contents: Contents,
         scene_of: Mapping[str, str],
-        *,
-        largest_picture: tuple[int, int],
         sensor: tuple[int, int],
         trajectory_names: Sequence[str],
     ) -> "SceneStore":
         """Create a store to write, or resume it; see `Store.create_parts`.
 
-        `scene_of` maps each sequence to the name of its scene. `largest_picture` and `sensor` are (height, width) in
-        pixels. ValueError if two sequences of one picture or its variants are in different splits.
+        `scene_of` maps each sequence to the name of its scene. `sensor` is (height, width) in pixels. ValueError if two
+        sequences of one picture or its variants are in different splits.
         """
         split_of: dict[str, str] = {}
         for sequence, picture in {**scene_of, **contents.variant_of}.items():
@@ -82,7 +75,6 @@ class SceneStore(SplitStore):
             list(contents.splits),
             **vars(contents),
             scene_of=dict(scene_of),
-            largest_picture=list(largest_picture),
             sensor_height=sensor[0],
             sensor_width=sensor[1],
             trajectory_names=list(trajectory_names),
@@ -121,9 +113,7 @@ class SceneStore(SplitStore):
         """Scene of a sequence; ValueError names the column of damaged data."""
         size = self.record(sequence)["picture_size"]
         (columns,) = self.read_columns(sequence, [*PLANES, *["valid"] * self.masked])
-        planes = {name: dequantise(name, columns[name].reshape(size)) for name in PLANES}
-        valid = torch.from_numpy(columns["valid"].reshape(size) == 1) if self.masked else None
-        return Polarization(**planes, valid=valid)
+        return Polarization(**{name: dequantise(name, pixels.reshape(size)) for name, pixels in columns.items()})
 
     def trajectory(self, sequence: str) -> Float64[np.ndarray, " k"]:
         """How the sensor moves: the numbers that `trajectory_names` names."""
@@ -141,15 +131,13 @@ class SceneStore(SplitStore):
         """The columns of a scene; ValueError for a scene that the store cannot hold."""
         planes = {plane: as_tensor(plane, getattr(scene, plane)) for plane in PLANES}
         check_same_shape(planes)
-        columns = {plane: quantise(plane, values, "height width").ravel() for plane, values in planes.items()}
-        size, (height, width) = tuple(scene.s0.shape), self.largest_picture
-        if not (self.sensor_height <= size[0] <= height and self.sensor_width <= size[1] <= width):
-            raise ValueError(
-                f"{name}: expected a picture between the sensor's {self.sensor_height}x{self.sensor_width} px and "
-                f"{height}x{width} px, got {size[0]}x{size[1]}"
-            )
-        known = self.checked_mask(scene.valid, size)
-        return columns | ({"valid": known.astype(np.uint8).ravel()} if self.masked else {})
+        columns = {plane: quantise(plane, values, "height width") for plane, values in planes.items()}
+        height, width = scene.s0.shape
+        if height < self.sensor_height or width < self.sensor_width:
+            sensor = f"{self.sensor_height}x{self.sensor_width} px"
+            raise ValueError(f"{name}: expected a picture of at least the sensor's {sensor}, got {height}x{width}")
+        columns |= self.mask_column(scene.valid, scene.s0.shape)
+        return {plane: values.ravel() for plane, values in columns.items()}
 
 
 def as_stored(scene: Polarization) -> Polarization:

@@ -53,7 +53,7 @@ def open_truth(path: str | os.PathLike[str], sequence: str) -> TrueFrames:
 
     >>> import torch
     >>> from polarnet.storage import Contents, FrameStore, open_truth
-    >>> store = FrameStore.create("truth", Contents({"lake": "test"}), n_frames=1, height=12, width=18)
+    >>> store = FrameStore.create("truth", Contents({"lake": "test"}), height=12, width=18)
     >>> store.write("lake", torch.tensor([0]), torch.full((1, 4, 12, 18), 0.5), *torch.zeros(2, 1, 12, 18))
     >>> store.finish()
     >>> open_truth("truth", "lake")[0].dolp.shape

@@ -17,7 +17,7 @@ SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
 def five_scenes(make_sequence, tmp_path_factory):
     folder = tmp_path_factory.mktemp("five_scenes")
     splits = {name: "train" if name.startswith("t") else "test" for name in SCENES}
-    frames = FrameStore.create(folder / "frames.zarr", Contents(splits, {"scenes": SCENES}), 5, 18, 20)
+    frames = FrameStore.create(folder / "frames.zarr", Contents(splits, {"scenes": SCENES}), 18, 20)
     events = EventStore.create(folder / "events.zarr", list(SCENES), 18, 20, {})
     rotating = EventStore.create(folder / "rotating.zarr", list(SCENES), 18, 20, {})
     for seed, name in enumerate(SCENES):

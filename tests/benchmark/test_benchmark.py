@@ -117,7 +117,7 @@ def test_panels_show_one_window_of_different_scenes_and_every_method(five_scenes
 
 
 def test_no_test_sequence_is_an_error(five_scenes, context, tmp_path):
-    frames = FrameStore.create(tmp_path / "f.zarr", Contents({"t1": "train"}), 5, 18, 20)
+    frames = FrameStore.create(tmp_path / "f.zarr", Contents({"t1": "train"}), 18, 20)
     frames.write("t1", *five_scenes.frames.frames("t1"))
     frames.finish()
     without = BenchmarkSet("simulated", five_scenes.events, FrameStore.open(tmp_path / "f.zarr"))

@@ -26,7 +26,7 @@ def config(project_root, simulated, tmp_path_factory):
     splits = {name: "test" if name == "d-0" else "train" for name in source.sequences}
     path = tmp_path_factory.mktemp("studied") / "frames.zarr"
     first = source.frames("d-0")
-    frames = FrameStore.create(path, Contents(splits, source.attributes), *first.dolp.shape)
+    frames = FrameStore.create(path, Contents(splits, source.attributes), *first.dolp.shape[1:])
     for name in splits:
         sequence = source.frames(name)
         frames.write(name, sequence.t_us, sequence.intensity, sequence.dolp, sequence.aolp)

@@ -3,9 +3,12 @@ import itertools
 import pytest
 import torch
 from event_fixtures import events_of, random_events
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from polarnet.events.representations import event_tensor, voxel_grid_of_window
 from polarnet.events.stream import Events, slice_time
-from polarnet.events.streaming import WindowCutter, WindowRule, cut_windows, parse_window
+from polarnet.events.streaming import WindowCutter, WindowRule, cut_windows, encode_windows, parse_window
 
 HEIGHT, WIDTH, DURATION_US = 6, 8, 20_000
 
@@ -107,3 +110,26 @@ def test_the_last_two_events_before_each_step_make_a_window():
     assert [(w.start_us, w.stop_us, w.channels[0].t.tolist()) for w in cut] == [
         (10, 100, [10, 20]), (120, 200, [120, 130]), (130, 300, [130, 250]),
     ]  # fmt: skip
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(0, 100), max_size=40), st.sets(st.integers(0, 100), min_size=2, max_size=6))
+def test_windows_share_out_all_events_from_the_first_frame_to_before_the_last(times, edges):
+    events = events_of([(t, 0, 0, 1) for t in sorted(times)], 1, 1)
+    parts = cut_windows(events, torch.tensor(sorted(edges)))
+    inside = slice_time(events, min(edges), max(edges))
+    assert torch.cat([part.t for part in parts]).tolist() == inside.t.tolist()
+
+
+def test_several_images_of_a_representation_stay_together_polarizer_by_polarizer():
+    t_us = torch.tensor([0, 6_000, 13_000])
+    inputs = encode_windows(CHANNELS, t_us, voxel_grid_of_window)
+    assert inputs.shape == (2, 20, HEIGHT, WIDTH)
+    assert torch.equal(inputs[1, 5:10], voxel_grid_of_window(slice_time(CHANNELS[1], 6_000, 13_000), 7_000))
+
+
+def test_two_frame_times_a_microsecond_apart_make_one_window_and_equal_ones_none():
+    assert encode_windows([Events.empty(2, 3)], torch.tensor([5, 6]), event_tensor).shape == (1, 1, 2, 3)
+    for times in ([5, 5], [5, 6, 6], [5]):
+        with pytest.raises(ValueError, match="at least two frame times, each later than the last"):
+            encode_windows([Events.empty(2, 3)], torch.tensor(times), event_tensor)

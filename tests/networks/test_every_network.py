@@ -54,7 +54,7 @@ def test_windows_at_once_are_windows_one_by_one_with_the_state_carried_and_strea
 
 @torch.no_grad()
 @pytest.mark.parametrize("name", ["polarnet", "polarnet, blocks", "paper"])
-@pytest.mark.parametrize(("height", "width"), [(16, 24), (17, 22), (21, 35), (120, 180)])
+@pytest.mark.parametrize(("height", "width"), [(16, 24), (21, 35)])
 def test_any_height_and_width_come_back_with_everything_predicted(name, height, width):
     build, channels, _ = NETWORKS[name]
     prediction, _ = build().eval()(torch.randint(-3, 4, (2, channels, height, width)).float())

@@ -156,10 +156,9 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
-        ("methods/overlap.py", ROWS | {"report"}),
         ("terminal/progress.py", set()),
-        ("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
-        thorough("networks/polarnet/stokes_unet.py", {"train", "report"} | ROWS),
+        thorough("methods/overlap.py", ROWS | {"report"}),
+        thorough("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
         thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
         thorough("networks/registry.py", {"report"} | ROWS),
         thorough("training/dolp.py", {"train"}),

@@ -49,9 +49,8 @@ def folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         folder / "scenes.zarr",
         Contents(dict.fromkeys(names, "train"), sequences_per_part=SEQUENCES_PER_PART),
         dict.fromkeys(names, "coffee"),
-        largest_picture=(200, 300),
-        sensor=(motion.sensor_height, motion.sensor_width),
-        trajectory_names=Trajectory.vector_names(),
+        (motion.sensor_height, motion.sensor_width),
+        Trajectory.vector_names(),
     )
     for number, name in enumerate(names):
         trajectory = random_trajectory(motion, 200, 300, np.random.default_rng(number))

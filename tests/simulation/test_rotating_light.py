@@ -90,10 +90,8 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     """The four channels' sensor, motion and size, with the events in the first channel."""
     config = load(project_root, ["rotating.frames_per_turn=32"])
     names = {"lake-00": "lake", "wood-00": "wood"}
-    store = SceneStore.create(
-        tmp_path / "scenes.zarr", Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"}), names,
-        largest_picture=(20, 30), sensor=(6, 8), trajectory_names=Trajectory.vector_names(),
-    )  # fmt: skip
+    contents = Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"})
+    store = SceneStore.create(tmp_path / "scenes.zarr", contents, names, (6, 8), Trajectory.vector_names())
     trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), REST, STILL, STILL, 10.0)
     maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
     for name in names:

@@ -16,7 +16,7 @@ from zarr.storage import LocalStore
 
 import polarnet.storage.events as store_module
 from polarnet.events.stream import Events, slice_time
-from polarnet.storage.events import IDEAL_ANALYZER, MAX_DURATION_US, EventStore
+from polarnet.storage.events import MAX_DURATION_US, EventStore
 
 HEIGHT, WIDTH = 12, 18
 DURATIONS_US = {"coffee": 1_000_000, "leaves": 250_500, "still": 40_000}
@@ -50,25 +50,20 @@ def test_events_come_back_as_they_were(finished, channels):
         assert all(equal(a, b) for a, b in zip(store.read(name), channels[name], strict=True))
 
 
-def test_analyzers_come_back_and_ideal_ones_take_no_room(channels, tmp_path):
-    uniform = torch.rand(4, 3, generator=torch.Generator().manual_seed(1))
-    spread = torch.rand(4, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
-
-    def written(name, analyzers, attributes) -> EventStore:
-        store = EventStore.create(tmp_path / name, list(DURATIONS_US), HEIGHT, WIDTH, attributes, 2)
-        for sequence, analyzer in zip(DURATIONS_US, analyzers, strict=True):
-            store.write(sequence, channels[sequence], DURATIONS_US[sequence], analyzer=analyzer)
-        store.finish()
-        assert EventStore.verify(tmp_path / name) == []
-        return EventStore.open(tmp_path / name)
-
-    store = written("some.zarr", [spread, uniform, IDEAL_ANALYZER], {"polarizers": {}})
-    for sequence, expected in zip(DURATIONS_US, [spread, uniform, IDEAL_ANALYZER], strict=True):
-        assert torch.equal(store.analyzer(sequence), expected)
-        assert all(equal(a, b) for a, b in zip(store.read(sequence), channels[sequence], strict=True))
-    assert written("recorded.zarr", [None] * 3, {}).analyzer("coffee") is None
-    written("simulated.zarr", [IDEAL_ANALYZER] * 3, {})
-    assert files_of(tmp_path / "recorded.zarr") == files_of(tmp_path / "simulated.zarr")
+def test_analyzers_come_back_those_of_pixels_and_those_of_channels(channels, tmp_path):
+    generator = torch.Generator().manual_seed(1)
+    uniform, spread = (torch.rand(4, 3, *size, generator=generator) for size in ((), (HEIGHT, WIDTH)))
+    expected = dict(zip(DURATIONS_US, (spread, uniform, None), strict=True))
+    store = EventStore.create(tmp_path / "some.zarr", list(DURATIONS_US), HEIGHT, WIDTH, {}, 2)
+    for name, analyzer in expected.items():
+        store.write(name, channels[name], DURATIONS_US[name], analyzer=analyzer)
+    store.finish()
+    assert EventStore.verify(tmp_path / "some.zarr") == []
+    store = EventStore.open(tmp_path / "some.zarr")
+    assert store.analyzer("still") is None
+    for name in ("coffee", "leaves"):
+        assert torch.equal(store.analyzer(name), expected[name])
+        assert all(equal(a, b) for a, b in zip(store.read(name), channels[name], strict=True))
     with pytest.raises(ValueError, match=r"analyzers of shape \(4, 3\) or \(4, 3, 12, 18\), got \(4, 3, 2, 2\)"):
         EventStore.create(tmp_path / "x", ["coffee"], HEIGHT, WIDTH, {}).write(
             "coffee", [], 1, None, spread[..., :2, :2]
@@ -210,22 +205,3 @@ def test_events_that_no_writer_accepts_are_refused_when_they_are_read(tmp_path, 
     for span in ((), (0, 500)):
         with pytest.raises(ValueError, match=rf"events\.zarr: a: event 1 of 2: {message}"):
             EventStore.open(tmp_path / "events.zarr").read("a", *span)
-
-
-@pytest.mark.parametrize(
-    "record",
-    [
-        {"duration_us": 10**15},
-        {"offsets": [0, 2, 1, 3, 4]},
-        {"offsets": [0, 4]},
-        {"rows": [-4, 0]},
-        {"index": []},
-    ],
-)
-def test_a_record_that_no_writer_makes_is_refused(tmp_path, record):
-    store = EventStore.create(tmp_path / "events.zarr", ["a"], 40, 60, {})
-    one = Events(*torch.ones(1, 1).long(), *torch.ones(2, 1).short(), torch.ones(1).to(torch.int8), 40, 60)
-    store.write("a", [one] * 4, 1000)
-    known = store.record("a")
-    with pytest.raises(ValueError, match=r"a: expected (offsets|a span)"):
-        store.check_record("a", {**known, **record})

@@ -41,7 +41,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Paths of an event store and a frame store of five sequences."""
     folder = tmp_path_factory.mktemp("stores")
     events = EventStore.create(folder / "events.zarr", list(SPLITS), HEIGHT, WIDTH, {})
-    frames = FrameStore.create(folder / "frames.zarr", Contents(SPLITS), WINDOWS + 1, HEIGHT, WIDTH)
+    frames = FrameStore.create(folder / "frames.zarr", Contents(SPLITS), HEIGHT, WIDTH)
     t_us = WINDOW_US * torch.arange(WINDOWS + 1)
     for name in SPLITS:
         generator = generator_for(1, name, "test")

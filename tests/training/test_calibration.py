@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_loop import CPU, LOOP, SEED, bytes_of, killed, run
+from part_fixtures import files_of
+from test_loop import CPU, LOOP, SEED, killed, run
 
 from polarnet.config.tree import load
 from polarnet.networks.base.checkpoint import load_checkpoint
@@ -15,8 +16,9 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.engine.calibration import RIDGES, Scene, fitted, weights_for
-from polarnet.training.engine.loop import TrainConfig, calibrate
+from polarnet.training.engine.loop import TrainConfig, calibrate, sequences_to_fit
 from polarnet.training.engine.losses import LossConfig
+from polarnet.training.engine.sequences import WindowDataset
 from polarnet.training.engine.task import open_split
 
 TRAIN = TrainConfig(**LOOP, representation=None, optimizer=None, start=None, scene_dolp=None)
@@ -133,8 +135,7 @@ def test_of_what_it_has_seen_nothing_of_it_expects_the_errors_of_a_guess(stores,
 def rewritten(frames: Path, path: Path, dolp_factors: Mapping[str, float], variant_of: Mapping[str, str]) -> FrameStore:
     """A copy of a frame store, with DoLP multiplied by the factor of its sequence, and with variants."""
     source = FrameStore.open(frames)
-    windows = len(source.t_us(source.sequences[0]))
-    copy = FrameStore.create(path, Contents(source.splits, variant_of=variant_of), windows, source.height, source.width)
+    copy = FrameStore.create(path, Contents(source.splits, variant_of=variant_of), source.height, source.width)
     for name in source.sequences:
         t_us, intensity, dolp, aolp, *valid = source.frames(name)
         copy.write(name, t_us, intensity, dolp_factors.get(name, 1.0) * dolp, aolp, *valid)
@@ -146,9 +147,8 @@ def rewritten(frames: Path, path: Path, dolp_factors: Mapping[str, float], varia
 def test_it_rests_on_variants_only_if_the_scenes_it_is_for_are_named(stores, tmp_path, task_of, scene_dolp, sequences):
     frames = rewritten(stores[1], tmp_path / "frames.zarr", {}, {"b": "a"})
     task = dataclasses.replace(task_of(), scene_dolp=scene_dolp)
-    content = bytes_of(run(task, (stores[0], tmp_path / "frames.zarr"), tmp_path / "run", TRAIN))
-    assert frames.of_split("train") == ["a", "b", "c"]
-    assert json.loads(content["best.json"])["expected_errors"]["sequences"] == sequences
+    train = WindowDataset(EventStore.open(stores[0]), frames, frames.of_split("train"), task.encode)
+    assert calibrate(task, sequences_to_fit(task, train), TRAIN, CPU, 0)["sequences"] == sequences
 
 
 def test_for_weakly_polarized_scenes_it_expects_more_of_what_the_weakest_ones_had(stores, tmp_path, task_of):
@@ -179,9 +179,9 @@ def test_a_training_starts_from_the_weights_of_another_but_not_from_its_expected
 
 
 def test_a_training_ends_with_it_even_if_killed_before(stores, tmp_path, task_of):
-    whole = bytes_of(run(task_of(), stores, tmp_path / "whole", TRAIN))
+    whole = files_of(run(task_of(), stores, tmp_path / "whole", TRAIN))
     killed(task_of(), 16, stores, tmp_path / "killed", TRAIN)
-    assert bytes_of(run(task_of(), stores, tmp_path / "killed", TRAIN)) == whole
+    assert files_of(run(task_of(), stores, tmp_path / "killed", TRAIN)) == whole
     said = json.loads(whole["best.json"])["expected_errors"]
     assert said["sequences"] == 3
     assert said["mse"] > 0

@@ -1,7 +1,6 @@
 """The loop at a size where a whole training takes a second: CPU, fp32."""
 
 import dataclasses
-import json
 import math
 import shutil
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from part_fixtures import files_of
 
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.e2v.e2vid import E2vid
@@ -78,13 +78,9 @@ def run(task: Task, stores: tuple[Path, Path], folder: Path, config: LoopConfig 
     return folder / "out"
 
 
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
-
-
 def test_a_training_leaves_best_and_last_checkpoint_and_history(stores, tmp_path):
     out = run(small_task(), stores, tmp_path)
-    files = bytes_of(out)
+    files = files_of(out)
     assert files.keys() == {"best.safetensors", "best.json", "last.safetensors", "last.json", "history.csv", SUMS}
     history = read_history(out)
     assert [row["epoch"] for row in history] == [0, 1]
@@ -117,12 +113,12 @@ def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path, config:
         run(dataclasses.replace(task, unroll=unroll), stores, folder, config)
 
 
-@pytest.mark.parametrize("killed_at", [1, 8, 9, 12, 16])  # each of two epochs has eight steps, validation included
+@pytest.mark.parametrize("killed_at", [8, 9, 12])  # each of two epochs has eight steps, validation included
 def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
     stores, tmp_path, undisturbed, killed_at
 ):
     killed(small_task(), killed_at, stores, tmp_path)
-    assert bytes_of(run(small_task(), stores, tmp_path)) == undisturbed
+    assert files_of(run(small_task(), stores, tmp_path)) == undisturbed
 
 
 def test_a_damaged_running_checkpoint_is_refused_wherever_the_damage_is(stores, tmp_path):
@@ -142,19 +138,9 @@ def test_a_damaged_running_checkpoint_is_refused_wherever_the_damage_is(stores, 
         run(small_task(), stores, tmp_path)
 
 
-def test_a_training_by_muon_that_is_killed_and_resumed_ends_so_too(stores, tmp_path):
-    def task() -> Task:
-        return dataclasses.replace(small_task(), optimizer="muon")
-
-    killed(task(), 10, stores, tmp_path / "killed")
-    resumed = bytes_of(run(task(), stores, tmp_path / "killed"))
-    assert resumed == bytes_of(run(task(), stores, tmp_path / "whole"))
-    assert json.loads(resumed["best.json"])["training"]["optimizer"] == "muon"
-
-
 @pytest.fixture(scope="module")
 def undisturbed(stores, tmp_path_factory) -> dict[str, bytes]:
-    return bytes_of(run(small_task(), stores, tmp_path_factory.mktemp("undisturbed")))
+    return files_of(run(small_task(), stores, tmp_path_factory.mktemp("undisturbed")))
 
 
 def test_a_changed_setting_starts_anew(stores, tmp_path):
@@ -168,7 +154,7 @@ def test_a_changed_setting_starts_anew(stores, tmp_path):
 
 
 def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
-    assert bytes_of(run(small_task(), stores, tmp_path, workers=2)) == undisturbed
+    assert files_of(run(small_task(), stores, tmp_path, workers=2)) == undisturbed
 
 
 def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
@@ -185,7 +171,9 @@ def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
     assert validate(task, split.train, config, CPU, workers=0)["mse"] < 0.2 * before
 
 
-@pytest.mark.parametrize(("arch", "network"), [("firenet", FireNet), ("e2vid", E2vid)])
+@pytest.mark.parametrize(
+    ("arch", "network"), [("firenet", FireNet), pytest.param("e2vid", E2vid, marks=pytest.mark.thorough)]
+)
 def test_the_e2v_baseline_trains_in_the_same_loop(stores, tmp_path, arch, network):
     config = dataclasses.replace(E2V, arch=arch, epochs=1, visits=1, windows=2)
     tensors, metadata = load_checkpoint(

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -5,6 +6,7 @@ import torch
 
 from polarnet import stokes
 from polarnet.events.representations import event_tensor
+from polarnet.events.stream import slice_time
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -76,6 +78,27 @@ def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views()
     firsts = [one.inputs for one in views if one.name == "a"]
     assert not torch.equal(firsts[0], firsts[1])
     assert torch.equal(visits[0].inputs, visits[0].inputs)
+
+
+def test_an_item_is_a_whole_sequence_with_the_truth_at_each_windows_end(stores):
+    events, frames = EventStore.open(stores[0]), FrameStore.open(stores[1])
+    item = WindowDataset(events, frames, ["b", "a"], event_tensor)[0]
+    assert item.name == "b"
+    t_us, intensity, dolp, aolp, _ = frames.frames("b")
+    for k, (start, stop) in enumerate(itertools.pairwise(t_us.tolist())):
+        for c, channel in enumerate(events.read("b")):
+            assert torch.equal(item.inputs[k, c], event_tensor(slice_time(channel, start, stop), stop - start))
+    for own, truth in ((item.dolp, dolp), (item.aolp, aolp), (item.intensity, intensity)):
+        assert torch.equal(own, truth[1:])
+
+
+def test_sequences_that_one_store_lacks_and_stores_of_different_sensors_are_refused(stores, tmp_path):
+    frames = FrameStore.open(stores[1])
+    with pytest.raises(ValueError, match="f: not both in"):
+        WindowDataset(EventStore.open(stores[0]), frames, ["a", "f"], event_tensor)
+    small = EventStore.create(tmp_path / "small.zarr", ["a"], 2, 3, {})
+    with pytest.raises(ValueError, match="events are 2x3 px"):
+        WindowDataset(small, frames, ["a"], event_tensor)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -68,9 +68,8 @@ def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_mach
 def masked(simulated, tmp_path):
     """The simulated sequences with the left third of all frames masked, and all of the first three frames."""
     source = FrameStore.open(simulated.frames)
-    frames = FrameStore.create(
-        tmp_path / "masked.zarr", Contents(source.splits, masked=True), 7, source.height, source.width
-    )
+    contents = Contents(source.splits, masked=True)
+    frames = FrameStore.create(tmp_path / "masked.zarr", contents, source.height, source.width)
     for name in source.sequences:
         truth = source.frames(name)
         valid = torch.ones_like(truth.dolp, dtype=torch.bool)
