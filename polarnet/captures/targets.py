@@ -38,7 +38,6 @@ from polarnet.storage.frames import Contents, FrameStore
 
 STATUS_FILE = "status.json"
 WHITE = 255.0  # maximum of reduced pictures
-MAX_DURATION_S = 600.0  # of a sequence, without `duration_s`
 
 
 class Target(NamedTuple):
