@@ -13,6 +13,8 @@ Command: TypeAlias = argparse.ArgumentParser
 AddCommand: TypeAlias = Callable[..., Command]
 """`_command` without its first argument."""
 
+BESIDE = ""
+"""Value of --truth without a path."""
 _wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
 
 
@@ -195,7 +197,7 @@ def _recover(command: AddCommand) -> None:
         "recover DoLP and AoLP from recordings or from a running camera",
         'recover recording.aedat4 --mosaic "90 45 / 135 0"',
         "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
-        "recover outputs/simulate/lake/events.zarr",
+        "recover outputs/simulate/lake/events.zarr --truth",
         "recover data/events.zarr --sequence lake-0 --step 1ms --write mp4",
         "recover camera.raw --rotating 15",
         'recover dv://camera --live --mosaic "90 45 / 135 0"',
@@ -218,6 +220,10 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--triggers", type=Path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
     add("--start-angle", type=float, metavar="DEG", help="its angle at time 0 or the first trigger (default: 0)")
     add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
+    add(
+        "--truth", nargs="?", const=BESIDE, metavar="FRAMES",
+        help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
+    )  # fmt: skip
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")

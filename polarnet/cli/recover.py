@@ -5,9 +5,11 @@ import functools
 import sys
 from pathlib import Path
 
+from polarnet.cli.commands import BESIDE
 from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, reading_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root
+from polarnet.cli.stores import is_store
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import Config, load
 from polarnet.events.rotation import Rotation
@@ -19,9 +21,11 @@ from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
-from polarnet.recovery.stream import ChosenMethod, Input, frames_of, open_method, recover
+from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
+from polarnet.storage.events import EventStore
+from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
 
 DEFAULT_METHOD, ROTATING_METHOD = "ours", "rotating_polarizer"
 RECONSTRUCT = "highpass"
@@ -29,9 +33,9 @@ RECONSTRUCT = "highpass"
 NETWORK_WINDOW = "33.333ms"
 ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
 """Options that say where the polarizers are."""
-NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "size", "part", *READING)
+NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", "part", *READING)
 NOT_ROTATING = (
-    "angles", "mosaic", "sequence", "method", "weights", "thresholds", "binning", "window", *CLEANING,
+    "angles", "mosaic", "sequence", "truth", "method", "weights", "thresholds", "binning", "window", *CLEANING,
 )  # fmt: skip
 """Options without a meaning for live input, and for one camera behind a rotating polarizer."""
 
@@ -45,6 +49,8 @@ def run(options: argparse.Namespace) -> None:
     method = options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD)
     settings = options.weights, options.precision, options.thresholds, options.binning, rotation
     recoverer, words = open_method(ChosenMethod(method, *settings), setup)
+    truth = _truth_of(options)
+    scores = TruthScores(truth) if truth else None
     out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     cleaner = Cleaner(cleaning_of(options), mosaic)
@@ -56,13 +62,18 @@ def run(options: argparse.Namespace) -> None:
         if polarized:
             check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
             source = source._replace(pieces=check.watch(source.pieces))
-        drawn = polarized and "mp4" in options.write
+        drawn = polarized and "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
-        writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct)
-        facts = recover(source, rule, words, writer, frames_of(source, rule, recoverer))
+        writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
+        frames = frames_of(source, rule, recoverer)
+        if scores:
+            frames = scores.watch(frames)
+        facts = recover(source, rule, words, writer, frames)
         if check:
             counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
+        if scores:
+            facts["scores"] = scores.sentence(config.benchmark.warmup_windows)
         if given(options, CLEANING):
             facts["removed"] = cleaner.sentence()
         notes = check.findings() if check else []
@@ -98,6 +109,19 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
     paths = [Path(path) for path in options.input]
     files = Files(paths, options.angles, mosaic, options.sequence, plain, open_file, config.recordings)
     return open_files(files, work, options.size, cleaner)
+
+
+def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
+    """True frames of option --truth; ValueError if the input is not a store with them."""
+    if options.truth is None:
+        return None
+    path = options.input[0]
+    if options.size or not is_store(path):
+        raise ValueError("--truth: expected an event store in its own size; leave out --truth or --size")
+    truth = truth_beside(path) if options.truth == BESIDE else options.truth
+    if truth is None:
+        raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {path}, there is none; name them")
+    return open_truth(truth, options.sequence or EventStore.open(path).sequences[0])
 
 
 def check_options(options: argparse.Namespace) -> None:

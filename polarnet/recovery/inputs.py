@@ -135,7 +135,7 @@ def _channels(files: Files, work: Path) -> Channels:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        return open_four(dict(zip(files.angles, files.paths, strict=True)), files.open)
+        return open_four(dict(zip(files.angles, files.paths, strict=True)), open_file=files.open)
     if len(files.paths) != 1 or files.angles is not None:
         raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
     (path,) = files.paths
@@ -144,7 +144,7 @@ def _channels(files: Files, work: Path) -> Channels:
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captured(path, work, files.captures)
     if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return open_four(exported, files.open, origin_us=0)  # times count from the sequence's start
+        return open_four(exported, dict.fromkeys(exported, 0), files.open)  # times count from the sequence's start
     if (path / METADATA).is_file():
         store = EventStore.open(path)
         return _stored(store, _named(files.sequence, store.sequences, path.name))

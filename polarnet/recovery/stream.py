@@ -1,5 +1,6 @@
 """`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
 
+import math
 import operator
 import statistics
 import time
@@ -16,14 +17,24 @@ from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, Event
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.stokes import Prediction
+from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
+SCORES = {
+    "mse": "MSE {:.4f}",
+    "psnr": "PSNR {:.2f} dB",
+    "ssim": "SSIM {:.3f}",
+    "corr": "correlation {:.3f}",
+    "aolp_deg": "AoLP error {:.1f} degrees",
+}
 
 
 class Input(NamedTuple):
@@ -206,3 +217,40 @@ def _too_short(source: Input, rule: WindowRule, duration_us: int) -> str:
     if duration_us < TRAINED_WINDOW_US:
         return f"{lasts}, or give a filter, --method highpass --window {duration_us}us"
     return f"{lasts}, or give --window {TRAINED_WINDOW_US / 1000:g}ms"
+
+
+class TruthScores:
+    """Scores of the frames that have a true frame at the end of their window, as in the benchmark."""
+
+    def __init__(self, truth: TrueFrames):
+        self._truth = truth
+        self._scores: list[dict[str, float]] = []
+        self._unmatched = 0
+
+    def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield the frames, scored."""
+        for frame in frames:
+            if self._truth.has(frame.window.stop_us, MAX_GAP * frame.window.length_us):
+                true = self._truth.at(frame.window.stop_us)
+                aolp = frame.prediction.aolp
+                batch = Prediction(frame.prediction.dolp[None], None if aolp is None else aolp[None])
+                valid = None if true.valid is None else true.valid[None]
+                scores = frame_scores(batch, true.dolp[None], true.aolp[None], valid)
+                self._scores.append({name: float(values) for name, values in scores.items()})
+            else:
+                self._unmatched += 1
+            yield frame
+
+    def sentence(self, skipped: int) -> str:
+        """Means after the first `skipped` scored frames, in words; ValueError if none is left."""
+        scores = self._scores[skipped:]
+        if not scores:
+            raise ValueError(
+                f"--truth: expected more than {skipped} frames with a true frame at the end of their window, got "
+                f"{len(self._scores)} of {len(self._scores) + self._unmatched}; leave out --window, or record "
+                f"for longer"
+            )
+        means = {name: math.fsum(one[name] for one in scores) / len(scores) for name in scores[0]}
+        words = ", ".join(SCORES[name].format(value) for name, value in means.items())
+        rest = f", {self._unmatched} frames without a true frame" if self._unmatched else ""
+        return f"{words} ({len(scores)} frames after the first {skipped}{rest})"

@@ -38,6 +38,7 @@ from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
+from polarnet.storage.true_frames import TrueFrames
 
 VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
@@ -82,14 +83,19 @@ class RecoveryWriter:
     `outputs` is a subset of zarr, png and mp4. The folder gets recovered.zarr, png/*.png and recovered.mp4
     (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
-    polarization at full value.
+    polarization at full value. `truth` is shown in the video beside each frame.
     """
 
     def __init__(
-        self, folder: Path, outputs: Collection[str], video_rate_hz: float, reconstruct: Recoverer | None = None
+        self,
+        folder: Path,
+        outputs: Collection[str],
+        video_rate_hz: float,
+        reconstruct: Recoverer | None = None,
+        truth: TrueFrames | None = None,
     ):
         self.folder, self.outputs = folder, outputs
-        self._reconstruct = reconstruct
+        self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
         self.frames = 0
         self._plain = False
@@ -163,7 +169,7 @@ class RecoveryWriter:
     def _labelled(
         self, window: EventWindow, prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """The picture of the video: events and DoLP above polarization and AoLP."""
+        """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
         above, below = {"events": events}, {}
@@ -172,10 +178,15 @@ class RecoveryWriter:
             above["DoLP"] = dolp_image(prediction.dolp)
         else:
             above["intensity"] = intensity_image(plain)
+        true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
-            if (s0 := self._s0(window, prediction)) is not None:
-                below["polarization, reconstructed S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
+            s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
+            if s0 is not None:
+                below[f"polarization, {kind} S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
             below["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
+        if true:
+            above["true DoLP"] = dolp_image(true.dolp)
+            below["true AoLP (hue), DoLP (saturation)"] = angle_image(true.dolp, true.aolp)
         foot = foot_of((window.start_us, window.stop_us), sum(map(len, window.channels)))
         return self._sheet.picture([above, below], foot)
 

@@ -37,6 +37,10 @@ class TrueFrames:
         first = number - number % FRAMES_PER_CHUNK
         return self._block(first, min(first + FRAMES_PER_CHUNK, len(self)))[number - first]
 
+    def has(self, t_us: int, within_us: float) -> bool:
+        """Whether there is a frame at a time, give or take `within_us`."""
+        return bool((np.abs(self.t_us - t_us) <= within_us).any())
+
     def at(self, t_us: int) -> Polarization:
         """The frame closest to a time."""
         return self[int(np.abs(self.t_us - t_us).argmin())]

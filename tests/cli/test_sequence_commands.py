@@ -1,4 +1,4 @@
-"""Commands on stored sequences: inspect, video, convert of some, and recovery."""
+"""Commands on stored sequences: inspect, video, convert of some, and recovery with truth."""
 
 import av
 import numpy as np
@@ -44,3 +44,16 @@ def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path)
     assert count >= 5
     np.testing.assert_array_equal(first["dolp"][:count], second["dolp"][:count])
     np.testing.assert_array_equal(second["dolp"][:], third["dolp"][:])
+
+
+def test_truth_scores_a_recovery_and_reaches_its_video(simulated, tmp_path, capsys):
+    command = ["recover", str(simulated.events), "--sequence", "b-0", "--method", "highpass", "--truth",
+               "--write", "mp4", "--out", str(tmp_path / "out")]  # fmt: skip
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "scores      MSE 0." in printed
+    assert "AoLP error" in printed
+    with av.open(str(tmp_path / "out" / "recovered.mp4")) as file:
+        assert next(file.decode(video=0)).width > 700  # three columns of panels
+    assert main([*command[:-2], "--size", "9", "12"]) == 1
+    assert "--truth: expected an event store in its own size" in capsys.readouterr().err
