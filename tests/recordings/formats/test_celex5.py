@@ -56,6 +56,7 @@ def test_polarity_is_the_sign_of_the_change_and_the_first_compares_with_zero(tmp
     )
     assert [written.t.tolist(), written.p.tolist()] == [[0, 0, 2048, 4096], [1, -1, -1, 1]]
     assert read(tmp_path / "e.bin")[1][3] == [1, -1, -1, 1]
+    assert read(tmp_path / "e.bin", clock_mhz=50)[1][0] == [0, 0, 4096, 8192]
 
 
 def test_pictures_read_back_equal_but_for_the_pixel_that_holds_the_mode(tmp_path):
@@ -124,3 +125,8 @@ def test_csv_of_other_modes_is_refused_with_the_reason(tmp_path, columns):
     path = write(tmp_path / "e.csv", [(10, 20, 5, 900, 7, 8)[:columns]])
     with pytest.raises(RecordingError, match=rf"e\.csv: .*got {columns}; its other modes, of 3 or 4 columns, have no"):
         read_recording(path, "celex5_csv")
+
+
+def test_time_stamps_of_old_converters_become_microseconds_at_the_clock_that_is_given(tmp_path, read):
+    path = write(tmp_path / "e.csv", [(1, 1, 7, 1, 0), (1, 1, 8, 1, 1), (1, 1, 9, 1, 100)])
+    assert read(path, clock_mhz=100)[1][0] == [0, 10, 1024]
