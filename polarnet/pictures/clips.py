@@ -137,12 +137,13 @@ def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, 
 def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3 h w"]:
     """sRGB code values, or light as shares of `white` (`images.light_of`); a picture with one channel is grey."""
     (path,) = paths
-    channels = images.read_channels(path)
+    light, channels = images.holds_light(path), images.read_channels(path)
     if channels.shape[2] == 1:
-        return np.repeat(code_fractions(channels).transpose(2, 0, 1), 3, axis=0)
+        grey = np.repeat(channels, 3, axis=2)
+        return (images.light_of(grey, white) if light else code_fractions(grey)).transpose(2, 0, 1)
     picture = images.read_picture(path)
-    if images.holds_light(path):
-        return images.light_of(picture, white).transpose(2, 0, 1)
+    if light:
+        return images.light_of(picture.pixels, white).transpose(2, 0, 1)
     return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 

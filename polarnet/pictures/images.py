@@ -80,6 +80,8 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
     channels, or values that are not finite.
     """
     pixels, spec, file_format = _read(Path(path))
+    if not _is_light(spec, file_format):
+        _check_white(pixels)
     profile = spec.get("ICCProfile")
     if profile is None and file_format == "png" and _names_profile(Path(path)):
         raise UnreadablePicture("the embedded colour profile is damaged; save the file again, with or without one")
@@ -95,7 +97,9 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
 
 def read_channels(path: str | os.PathLike[str], as_stored: bool = False) -> Shaped[np.ndarray, "h w c"]:
     """The upright code values of all channels except alpha, or `as_stored`; raises as `read_picture` does."""
-    pixels, spec, _ = _read(Path(path), as_stored)
+    pixels, spec, file_format = _read(Path(path), as_stored)
+    if not _is_light(spec, file_format):
+        _check_white(pixels)
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
 
@@ -195,6 +199,7 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
     torch.Size([3, 512, 512])
     """
     picture = read_picture(path)
+    _check_white(picture.pixels)
     rows, columns = picture.pixels.shape[:2]
     rgb = srgb_of(fit(picture.pixels, rows, columns, 1.0), picture)
     return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
@@ -219,7 +224,7 @@ def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
             f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} "
             f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
         )
-    return torch.from_numpy(np.ascontiguousarray(light_of(picture).transpose(2, 0, 1)))
+    return torch.from_numpy(np.ascontiguousarray(light_of(picture.pixels).transpose(2, 0, 1)))
 
 
 def holds_light(path: str | os.PathLike[str]) -> bool:
@@ -233,20 +238,19 @@ def holds_light(path: str | os.PathLike[str]) -> bool:
         return False
     spec, file_format = file.spec(), file.format_name()
     file.close()
-    floating = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
-    return floating and "lin" in _colour_space(spec, file_format)
+    return _is_light(spec, file_format)
 
 
-def light_of(picture: Picture, white: float | None = None) -> Float32[np.ndarray, "h w 3"]:
-    """Pixels of a picture of linear light as shares of `white`, clipped to [0, 1]; None: of its brightest value.
+def light_of(pixels: Float32[np.ndarray, "h w 3"], white: float | None = None) -> Float32[np.ndarray, "h w 3"]:
+    """Pixels of linear light as shares of `white`, clipped to [0, 1]; None: of their brightest value.
 
     Without `white` nothing is clipped but negative values, so that the picture keeps its range. UnreadablePicture for a
     picture without light.
     """
-    white = float(picture.pixels.max()) if white is None else white
+    white = float(pixels.max()) if white is None else white
     if not white > 0:
         raise UnreadablePicture("no light: no value is above 0")
-    return np.clip(picture.pixels / np.float32(white), 0, 1)
+    return np.clip(pixels / np.float32(white), 0, 1)
 
 
 def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
@@ -285,6 +289,11 @@ def _opened(path: Path) -> Any:
     return file
 
 
+def _is_light(spec: Any, file_format: str) -> bool:
+    floating = spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+    return floating and "lin" in _colour_space(spec, file_format)
+
+
 def _colour_space(spec: Any, file_format: str) -> str:
     """OpenImageIO's name of a file's encoding; empty if it is not known."""
     named = spec.get_string_attribute("oiio:ColorSpace")
@@ -317,12 +326,18 @@ def _plain(pixels: Shaped[np.ndarray, "h w c"]) -> Shaped[np.ndarray, "h w c"]:
         return (pixels / np.iinfo(pixels.dtype).max).astype(np.float32)
     if not np.isfinite(pixels).all():
         raise UnreadablePicture(f"{np.count_nonzero(~np.isfinite(pixels))} values are not finite numbers")
+    return pixels.astype(np.float32)
+
+
+def _check_white(pixels: Shaped[np.ndarray, "h w c"]) -> None:
+    """UnreadablePicture for floating-point values that cannot have 1.0 as white."""
+    if np.issubdtype(pixels.dtype, np.integer):
+        return
     middle, largest = float(np.median(pixels.astype(np.float64))), float(pixels.max())
     if not 0 <= middle <= 1 or 0 < largest < LEAST_WHITE:
         raise UnreadablePicture(
             f"expected floats with 1.0 as white, got a median of {middle:g} and at most {largest:g}; scale the picture"
         )
-    return pixels.astype(np.float32)
 
 
 def _first_line(message: str, path: Path) -> str:

@@ -202,7 +202,7 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     number, source = item
     try:
         picture, light = images.read_picture(source.files[0]), images.holds_light(source.files[0])
-        pixels = images.light_of(picture) if light else picture.pixels
+        pixels = images.light_of(picture.pixels) if light else picture.pixels
         fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
         rgb = fitted if light else images.srgb_of(fitted, picture)
     except UnreadablePicture as error:

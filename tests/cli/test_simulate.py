@@ -119,7 +119,7 @@ def test_the_dynamic_range_stretches_photographs_and_leaves_the_light_of_an_exr(
     assert main(["simulate", "lake.png", *options]) == 0
     assert_equal(stored(), simulate(rgb(photograph[None])[0], motion, sensor, seed=1).events)
     light = (10 ** (photograph / 20 - 6)).astype(np.float32)
-    assert oiio.ImageBuf(light).write("lake.exr")
+    assert oiio.ImageBuf(2**23 * light).write("lake.exr")  # its scale is free, as in cd/m²
     assert main(["simulate", "lake.exr", *options]) == 0
     scene = scene_from_light(torch.from_numpy(light / light.max()).permute(2, 0, 1).contiguous())
     assert_equal(stored(), simulate(scene, MOTION, sensor, seed=1).events)
