@@ -2,7 +2,9 @@
 
 import contextlib
 import itertools
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -65,7 +67,9 @@ def start(name: str, variant: int, sequences: list[str], output: Path) -> subpro
     words, further, _ = COMMANDS[name]
     word = further[variant].replace("FIRST", sequences[0]).replace("LAST", sequences[-1])
     with output.open("wb") as file:
-        return subprocess.Popen([sys.executable, "-m", *words, word], stdout=file, stderr=subprocess.STDOUT)
+        return subprocess.Popen(
+            [sys.executable, "-m", *words, word], stdout=file, stderr=subprocess.STDOUT, start_new_session=True
+        )
 
 
 def result_of(name: str) -> str | None:
@@ -138,7 +142,8 @@ def outcome(
         codes = [process.wait(MAX_SECONDS) for process in processes]
     except subprocess.TimeoutExpired as error:
         for process in processes:
-            process.kill()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the stages that it started
         return "stuck", str(error)
     texts = [output.read_text() for output in outputs]
     well = [name for name, code in zip(names, codes, strict=True) if code == 0]
