@@ -2,7 +2,9 @@
 
 import contextlib
 import itertools
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -30,7 +32,7 @@ TINY: dict[str, dict[str, Any]] = {
     "baselines": {"e2v": {"crop": [24, 32], "lpips": 0}},
 }
 """Values of params.yaml that make a training short."""
-MAX_DELAY_S, MAX_SECONDS = 6.0, 120.0
+MAX_DELAY_S, MAX_SECONDS = 6.0, 600.0
 OUTCOMES = ("waited", "refused", "unnamed", "traceback", "lost", "stuck")
 POLARNET, TO_PLACE = "polarnet.cli", ["--out", PLACE]
 COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
@@ -65,7 +67,9 @@ def start(name: str, variant: int, sequences: list[str], output: Path) -> subpro
     words, further, _ = COMMANDS[name]
     word = further[variant].replace("FIRST", sequences[0]).replace("LAST", sequences[-1])
     with output.open("wb") as file:
-        return subprocess.Popen([sys.executable, "-m", *words, word], stdout=file, stderr=subprocess.STDOUT)
+        return subprocess.Popen(
+            [sys.executable, "-m", *words, word], stdout=file, stderr=subprocess.STDOUT, start_new_session=True
+        )
 
 
 def result_of(name: str) -> str | None:
@@ -138,7 +142,8 @@ def outcome(
         codes = [process.wait(MAX_SECONDS) for process in processes]
     except subprocess.TimeoutExpired as error:
         for process in processes:
-            process.kill()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with the stages that it started
         return "stuck", str(error)
     texts = [output.read_text() for output in outputs]
     well = [name for name, code in zip(names, codes, strict=True) if code == 0]

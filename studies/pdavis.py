@@ -7,7 +7,6 @@ file, and AoLP of its frames, are compared with the polarizer's. --write: docs/r
 """
 
 import math
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,11 @@ from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
-from polarnet.pictures.images import read_rgb
+from polarnet.pictures.images import read_rgb, write_png
 from polarnet.recordings.truth import read_truth
-from polarnet.simulation.presets import MOTIONS, SENSORS
-from polarnet.simulation.scene import scene_from_polarization
-from polarnet.simulation.sequence import simulate
+from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, stokes_from_polarization
+from polarnet.storage.events import EventStore
+from polarnet.storage.true_frames import APPENDED, open_truth
 from studies.recording_files import EXPOSURE_US, WHITE, mosaicked, write_aedat2, write_e2p
 from studies.study import arguments_of, command_line, machine_record, write_section
 
@@ -54,18 +53,33 @@ def write_aedat4(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], fram
         writer.writeFrame(frame)
 
 
-def write_recordings(folder: Path, polarizer_deg: int) -> list[Path]:
-    """Two seconds behind a polarizer in the three formats; frames start at the half of an exposure."""
+def simulate(folder: Path, polarizer_deg: int) -> Path:
+    """Events and frames behind a polarizer, by `polarnet simulate` from its four measured intensities."""
     grey = read_rgb(next(one.path for one in BUILTIN_PHOTOS if one.path.stem == "astronaut")).mean(0)
     row, column = (torch.arange(side) // SQUARE % 2 for side in grey.shape)
-    polarized, angle = (row[:, None] == column) * TRUE_DOLP, math.radians(polarizer_deg)
-    scene = scene_from_polarization(grey, polarized, torch.full_like(grey, angle))
-    motion = replace(MOTIONS["default"], sensor_height=130, sensor_width=173, duration_s=2.0)
-    simulation = simulate(scene, motion, SENSORS["default"], seed=1)
-    events, inside = join_mosaic(simulation.events, MOSAIC), simulation.t_us >= EXPOSURE_US
-    light = mosaicked(2 * simulation.intensities[inside].numpy()).clip(0, 1)
-    levels, t_us = np.rint(WHITE * light).astype(np.uint8), simulation.t_us[inside].numpy()
-    name = folder / f"pdavis_{polarizer_deg:03d}"
+    polarized = (row[:, None] == column) * TRUE_DOLP
+    pictures = []
+    for angle in POLARIZER_ANGLES_DEG:
+        light = grey * (1 + polarized * math.cos(2 * math.radians(angle - polarizer_deg))) / (1 + TRUE_DOLP)
+        pictures.append(folder / f"polarizer{polarizer_deg}_{angle}.png")
+        write_png(pictures[-1], np.repeat(light.numpy()[..., None], 3, axis=2).astype(np.float32), 16)
+    made = folder / f"simulated_{polarizer_deg}"
+    size = ["synthesize.sensor_height=130", "synthesize.sensor_width=173", "synthesize.duration_s=2"]
+    if polarnet(["simulate", *map(str, pictures), "--out", str(made), "--no-preview", *size]):
+        raise SystemExit("polarnet simulate failed")
+    return made
+
+
+def write_recordings(made: Path, folder: Path, polarizer_deg: int) -> list[Path]:
+    """The simulated events and frames in the three formats; time starts at the half of an exposure."""
+    store = EventStore.open(made / "events.zarr")
+    events = join_mosaic(store.read(store.sequences[0]), MOSAIC)
+    truth = open_truth(made / APPENDED, store.sequences[0])
+    inside = np.flatnonzero(truth.t_us >= EXPOSURE_US)
+    frames = [truth[int(k)] for k in inside]
+    intensity = intensities_from_stokes(torch.stack([stokes_from_polarization(f.s0, f.dolp, f.aolp) for f in frames]))
+    levels = np.rint(WHITE * mosaicked(2 * intensity.numpy()).clip(0, 1)).astype(np.uint8)
+    t_us, name = truth.t_us[inside], folder / f"pdavis_{polarizer_deg:03d}"
     write_aedat2(name.with_suffix(".aedat"), events, t_us, levels)
     write_aedat4(name.with_suffix(".aedat4"), events, t_us, levels)
     write_e2p(name.with_suffix(".h5"), events, t_us, levels, None)
@@ -111,7 +125,7 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     record, rows = machine_record(), []
     for polarizer_deg in POLARIZERS_DEG:
-        for recording in write_recordings(arguments.folder, polarizer_deg):
+        for recording in write_recordings(simulate(arguments.folder, polarizer_deg), arguments.folder, polarizer_deg):
             rows.append(score(recording, polarizer_deg))
             print(rows[-1], flush=True)
     if arguments.write:
