@@ -4,11 +4,13 @@ Each command runs in a fork of this process, which has imported the libraries, a
 `dvc repro` start; the rest is as in a shell.
 """
 
+import faulthandler
 import importlib
 import itertools
 import multiprocessing
 import os
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -44,7 +46,10 @@ TINY: dict[str, dict[str, Any]] = {
     "baselines": {"e2v": {"crop": [24, 32], "lpips": 0}},
 }
 """Values of params.yaml that make a training short."""
+STUDY = os.getpid()
 MAX_DELAY_S = 6.0
+STUCK_S = 120
+"""A command that takes longer does not end."""
 TO_PLACE = ["--out", PLACE]
 COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
     "recover": (
@@ -74,10 +79,13 @@ def start(words: Sequence[str], output: Path) -> Any:
 
 
 def run(words: list[str], output: Path) -> None:
-    """Run a command in this process, which ends."""
+    """Run a command in this process, which ends; SIGUSR1 shows where it is."""
+    if os.getppid() == STUDY:
+        os.setpgrp()  # so that it can be killed with the processes that it starts
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for standard in (1, 2):
         os.dup2(descriptor, standard)
+    faulthandler.register(signal.SIGUSR1, file=descriptor)
     name, *arguments = words
     sys.argv = words
     if name.startswith("stages."):
@@ -130,6 +138,8 @@ def prepare(run_folder: Path, scratch: Path) -> None:
         for key, value in values.items():
             params[section][key] = {**params[section][key], **value} if isinstance(value, dict) else value
     yaml.dump(params, Path("params.yaml"))
+    config = Path("conf", "config.yaml")
+    config.write_text(config.read_text().replace("threads: 0", "threads: 1"))
     first, *_, last = EventStore.open(STORE).sequences
     for words in COMMANDS.values():
         words[1][:] = [word.replace("FIRST", first).replace("LAST", last) for word in words[1]]
@@ -197,10 +207,12 @@ def outcome(
     time.sleep(delay)
     processes = [first, start(words_of(names[1], 1), outputs[1])]
     for process in processes:
-        process.join(120)
-        if process.exitcode is None:
-            process.kill()
-            return "stuck", "it does not end"
+        process.join(STUCK_S)
+    if running := [process for process in processes if process.exitcode is None]:
+        for number, process in itertools.product((signal.SIGUSR1, signal.SIGKILL), running):
+            os.killpg(process.pid, number)
+            process.join(1)
+        return "stuck", "".join(output.read_text() for output in outputs)[-6000:]
     texts = [output.read_text() for output in outputs]
     well = [name for name, process in zip(names, processes, strict=True) if process.exitcode == 0]
     message = " | ".join(text.strip().splitlines()[-1] if text.strip() else "" for text in texts)
