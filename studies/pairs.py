@@ -1,25 +1,39 @@
-"""Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole."""
+"""Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole.
 
-import contextlib
+Each command runs in a fork of this process, which has imported the libraries, as do the stages that `stages.trial` and
+`dvc repro` start; the rest is as in a shell.
+"""
+
+import faulthandler
+import importlib
 import itertools
+import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import dvc.cli
+import dvc.stage.run
+import torch
+from dvc.stage.exceptions import StageCmdFailedError
+from hydra.core.global_hydra import GlobalHydra
 from ruamel.yaml import YAML
 
+from polarnet import cli
+from polarnet.cli import recover, simulate, stores  # noqa: F401 (so that forks need not import them)
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.files import files_of, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 
+FORK = multiprocessing.get_context("fork")
 PLACE = "data/train/ours"
 """Where every command writes: `dvc repro train` writes nowhere else."""
 STORE = "data/events.zarr"
@@ -32,49 +46,78 @@ TINY: dict[str, dict[str, Any]] = {
     "baselines": {"e2v": {"crop": [24, 32], "lpips": 0}},
 }
 """Values of params.yaml that make a training short."""
-MAX_DELAY_S, MAX_SECONDS = 6.0, 600.0
-OUTCOMES = ("waited", "refused", "unnamed", "traceback", "lost", "stuck")
-POLARNET, TO_PLACE = "polarnet.cli", ["--out", PLACE]
+STUDY = os.getpid()
+MAX_DELAY_S = 6.0
+STUCK_S = 120
+"""A command that takes longer does not end."""
+TO_PLACE = ["--out", PLACE]
 COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
     "recover": (
-        [POLARNET, "recover", STORE, "--method", "cf", "--write", "zarr", *TO_PLACE],
+        ["recover", STORE, "--method", "cf", "--write", "zarr", *TO_PLACE],
         ["--sequence=FIRST", "--sequence=LAST"],
         ("recovered.zarr",),
     ),
     "simulate": (
-        [POLARNET, "simulate", str(BUILTIN_PHOTOS[0].path), "--no-preview", *TO_PLACE, *SMALL],
+        ["simulate", str(BUILTIN_PHOTOS[0].path), "--no-preview", *TO_PLACE, *SMALL],
         ["seed=1", "seed=2"],
         ("events.zarr", "truth.zarr"),
     ),
-    "demo": (
-        [POLARNET, "demo", *TO_PLACE, *SMALL],
-        ["seed=1", "seed=2"],
-        ("simulated/events.zarr", "recovered/recovered.zarr"),
-    ),
-    "view": ([POLARNET, "view", STORE, "--no-browser", *TO_PLACE], ["--sequence=FIRST", "--sequence=LAST"], ("",)),
-    "trial": (
-        ["stages.trial", f"hydra.run.dir={PLACE}", "benchmark.methods=[ours]"],
-        ["loss.mse=1.0", "loss.mse=2.0"],
-        ("train/ours", "finished.json"),
-    ),
-    "dvc repro": (["dvc", "repro", "-s", "--no-run-cache", "--no-commit", "train"], ["--force", "--force"], ("",)),
-}
+    "demo": (["demo", *TO_PLACE, *SMALL], ["seed=1", "seed=2"], ("simulated/events.zarr", "recovered/recovered.zarr")),
+    "view": (["view", STORE, "--no-browser", *TO_PLACE], ["--sequence=FIRST", "--sequence=LAST"], ("",)),
+    "trial": (["stages.trial", f"hydra.run.dir={PLACE}", "benchmark.methods=[ours]"],
+              ["loss.mse=1.0", "loss.mse=2.0"], ("train/ours", "finished.json")),
+    "dvc repro": (["dvc", "repro", "-f", "-s", "--no-run-cache", "--no-commit", "train"], ["", ""], ("",)),
+}  # fmt: skip
 """Words of each command, words that make two results differ, and the files or folders that hold a result."""
 
 
-def start(name: str, variant: int, sequences: list[str], output: Path) -> subprocess.Popen[bytes]:
-    """A command of COMMANDS in a process, which writes its messages into a file."""
-    words, further, _ = COMMANDS[name]
-    word = further[variant].replace("FIRST", sequences[0]).replace("LAST", sequences[-1])
-    with output.open("wb") as file:
-        return subprocess.Popen(
-            [sys.executable, "-m", *words, word], stdout=file, stderr=subprocess.STDOUT, start_new_session=True
-        )
+def start(words: Sequence[str], output: Path) -> Any:
+    """A process that runs a command and writes its messages into a file."""
+    process = FORK.Process(target=run, args=([word for word in words if word], output))
+    process.start()
+    return process
+
+
+def run(words: list[str], output: Path) -> None:
+    """Run a command in this process, which ends; SIGUSR1 shows where it is."""
+    if os.getppid() == STUDY:
+        os.setpgrp()  # so that it can be killed with the processes that it starts
+    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    for standard in (1, 2):
+        os.dup2(descriptor, standard)
+    faulthandler.register(signal.SIGUSR1, file=descriptor)
+    name, *arguments = words
+    sys.argv = words
+    if name.startswith("stages."):
+        GlobalHydra.instance().clear()  # of a trial, if this is one of its stages
+        with mock.patch("stages.trial._failure", stage_failure):
+            sys.exit(sys.modules[name].main())
+    if name == "dvc":
+        with mock.patch("dvc.stage.run._run", stage_or_raise):
+            sys.exit(dvc.cli.main(arguments))
+    sys.exit(cli.main(words))
+
+
+def stage_failure(command: Sequence[str]) -> str | None:
+    """In place of that of `stages.trial`: the stage runs in a fork."""
+    with tempfile.NamedTemporaryFile() as output:
+        process = start(command[2:], Path(output.name))
+        process.join()
+        message = Path(output.name).read_text()
+    print(message, file=sys.stderr)
+    return message.strip().splitlines()[-1] if process.exitcode else None
+
+
+def stage_or_raise(executable: str | None, command: str, **options: Any) -> None:
+    """In place of that of DVC: the stage runs in a fork."""
+    if stage_failure(command.split()):
+        raise StageCmdFailedError(command, 1)
 
 
 def result_of(name: str) -> str | None:
     """Digest of the result of a command at PLACE; None if there is none."""
-    files = [file for part in COMMANDS[name][2] for file in files_of(Path(PLACE, part))]
+    places = [Path(PLACE, part) for part in COMMANDS[name][2]]
+    files = [file for place in places for file in files_of(place)]
     return sha256(*(part for file in files for part in (str(file).encode(), file))) if files else None
 
 
@@ -84,17 +127,27 @@ def clear() -> None:
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def prepare(run_folder: Path, project: Path) -> None:
-    """A copy of a project with a finished run, whose trainings are short."""
-    shutil.copytree(run_folder, project, ignore=shutil.ignore_patterns(".git", "cache", "tmp"), symlinks=True)
-    (project / ".dvc" / "config.local").write_text("[core]\n    no_scm = true\n    analytics = false\n")
+def prepare(run_folder: Path, scratch: Path) -> None:
+    """A copy of a project with a finished run, whose trainings are short; it becomes the working folder."""
+    shutil.copytree(run_folder, scratch, ignore=shutil.ignore_patterns(".git", "cache", "tmp"), symlinks=True)
+    os.chdir(scratch)
+    Path(".dvc", "config.local").write_text("[core]\n    no_scm = true\n    analytics = false\n")
     yaml = YAML()
-    params = yaml.load(project / "params.yaml")
+    params = yaml.load(Path("params.yaml"))
     for section, values in TINY.items():
         for key, value in values.items():
             params[section][key] = {**params[section][key], **value} if isinstance(value, dict) else value
-    yaml.dump(params, project / "params.yaml")
-    subprocess.run([sys.executable, "-m", "stages.weights"], cwd=project, check=True)  # short trainings need none
+    yaml.dump(params, Path("params.yaml"))
+    config = Path("conf", "config.yaml")
+    config.write_text(config.read_text().replace("threads: 0", "threads: 1"))
+    first, *_, last = EventStore.open(STORE).sequences
+    for words in COMMANDS.values():
+        words[1][:] = [word.replace("FIRST", first).replace("LAST", last) for word in words[1]]
+    sys.path.insert(0, str(scratch))  # so that the stages are those of the project, with its settings
+    for name in ("row", "train", "trial", "weights"):
+        importlib.import_module(f"stages.{name}")
+    start(["stages.weights"], scratch / "output").join()  # the short trainings need none
+    torch.set_num_threads(1)
 
 
 def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
@@ -103,56 +156,71 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
     A trial is paired with itself alone: no other command writes into the folder of a sweep.
     """
     both = [pair for pair in itertools.combinations_with_replacement(COMMANDS, 2) if pair.count("trial") != 1]
-    counts = {pair: Counter(dict.fromkeys(OUTCOMES, 0)) for pair in both}
+    counts = {
+        f"{one} and {other} at once": dict.fromkeys(("waited", "refused", "unnamed", "traceback", "lost", "stuck"), 0)
+        for one, other in both
+    }
+    before = Path.cwd()
     with tempfile.TemporaryDirectory() as folder:
         prepare(run_folder, Path(folder, "project"))
-        with contextlib.chdir(Path(folder, "project")):
-            sequences, outputs = EventStore.open(STORE).sequences, [Path(folder, name) for name in ("first", "second")]
-            expected: dict[str, list[str | None]] = {name: [] for name in COMMANDS}
-            seconds: dict[str, float] = {}
-            for name, variant in itertools.product(COMMANDS, (0, 1)):
+        output = Path(folder, "output")
+        expected: dict[str, list[str | None]] = {}
+        seconds: dict[str, float] = {}
+        for name in COMMANDS:
+            for variant in (0, 1):
                 clear()
                 began = time.monotonic()
-                if start(name, variant, sequences, outputs[0]).wait():
-                    raise SystemExit(f"{name} does not run alone:\n{outputs[0].read_text()[-3000:]}")
+                process = start(words_of(name, variant), output)
+                process.join()
+                if process.exitcode:
+                    raise SystemExit(f"{name} does not run alone:\n{output.read_text()[-3000:]}")
+                expected.setdefault(name, []).append(result_of(name))
                 seconds[name] = time.monotonic() - began
-                expected[name].append(result_of(name))
-            for number, pair in itertools.product(range(cases), both):
-                clear()
-                most_s = min(1.2 * seconds[pair[0]], MAX_DELAY_S)
-                delay_s = generator_for(number, " and ".join(pair), "delay").uniform(0, most_s)
-                processes = [start(pair[0], 0, sequences, outputs[0])]
-                time.sleep(delay_s)
-                processes.append(start(pair[1], 1, sequences, outputs[1]))
-                what, message = outcome(pair, processes, outputs, expected)
-                counts[pair][what] += 1
-                if what not in ("waited", "refused"):
-                    print(f"{what}: {' and '.join(pair)}, {delay_s:.2f} s apart: {message}", flush=True)
-    return {f"{one} and {other} at once": dict(counts[one, other]) for one, other in both}
+            print(name, f"{seconds[name]:.1f} s", flush=True)
+        for number, (one, other) in itertools.product(range(cases), both):
+            clear()
+            delay = generator_for(number, f"{one} and {other}", "delay").uniform(
+                0, min(1.2 * seconds[one], MAX_DELAY_S)
+            )
+            what, message = outcome((one, other), delay, Path(folder), expected)
+            counts[f"{one} and {other} at once"][what] += 1
+            if what not in ("waited", "refused"):
+                print(f"{what}: {one} and {other}, {delay:.2f} s apart: {message}", flush=True)
+        os.chdir(before)
+    return counts
+
+
+def words_of(name: str, variant: int) -> list[str]:
+    """Words of a command."""
+    words, further, _ = COMMANDS[name]
+    return [*words, further[variant]]
 
 
 def outcome(
-    names: tuple[str, str],
-    processes: list[subprocess.Popen[bytes]],
-    outputs: list[Path],
-    expected: dict[str, list[str | None]],
+    names: tuple[str, str], delay: float, folder: Path, expected: dict[str, list[str | None]]
 ) -> tuple[str, str]:
     """Outcome of two commands, and their messages."""
-    try:
-        codes = [process.wait(MAX_SECONDS) for process in processes]
-    except subprocess.TimeoutExpired as error:
-        for process in processes:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)  # with the stages that it started
-        return "stuck", str(error)
+    outputs = [folder / "first", folder / "second"]
+    for output in outputs:
+        output.unlink(missing_ok=True)
+    first = start(words_of(names[0], 0), outputs[0])
+    time.sleep(delay)
+    processes = [first, start(words_of(names[1], 1), outputs[1])]
+    for process in processes:
+        process.join(STUCK_S)
+    if running := [process for process in processes if process.exitcode is None]:
+        for number, process in itertools.product((signal.SIGUSR1, signal.SIGKILL), running):
+            os.killpg(process.pid, number)
+            process.join(1)
+        return "stuck", "".join(output.read_text() for output in outputs)[-6000:]
     texts = [output.read_text() for output in outputs]
-    well = [name for name, code in zip(names, codes, strict=True) if code == 0]
-    message = " | ".join("".join(text.strip().splitlines()[-1:]) for text in texts)
+    well = [name for name, process in zip(names, processes, strict=True) if process.exitcode == 0]
+    message = " | ".join(text.strip().splitlines()[-1] if text.strip() else "" for text in texts)
     if "Traceback" in "".join(texts):
         return "traceback", "".join(texts)[-3000:]
     if not any(result_of(name) in expected[name] for name in well):
         return "lost", f"{well} ended well, but left no whole result: {message}"
-    refusals = [text for text, code in zip(texts, codes, strict=True) if code]
+    refusals = [text for text, process in zip(texts, processes, strict=True) if process.exitcode]
     if not all(PLACE in text or "ours" in text for text in refusals):
         return "unnamed", message
     return ("refused" if refusals else "waited"), message
