@@ -87,9 +87,7 @@ def publish(finished: Path, place: Path) -> None:
     exchange two folders at once, a kill between two renames leaves the old one as PLACE.old.tmp, which `claimed`
     restores.
     """
-    for path in (*finished.rglob("*"), finished):
-        if not path.is_symlink():
-            _to_disk(path)
+    to_disk(finished)
     old = _old(place)
     shutil.rmtree(old, ignore_errors=True)  # of a process that was killed while it removed it
     if not place.exists():
@@ -101,6 +99,13 @@ def publish(finished: Path, place: Path) -> None:
         os.rename(finished, place)
     _to_disk(place.parent)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def to_disk(folder: Path) -> None:
+    """Bring a folder and everything in it to the disk."""
+    for path in (*folder.rglob("*"), folder):
+        if not path.is_symlink():
+            _to_disk(path)
 
 
 def _old(place: Path) -> Path:

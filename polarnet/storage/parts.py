@@ -37,7 +37,16 @@ import zarr
 from pydantic import PositiveInt
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from polarnet.runtime.files import check_name, check_room, claimed, code_digest, named_shortage, publish, sha256
+from polarnet.runtime.files import (
+    check_name,
+    check_room,
+    claimed,
+    code_digest,
+    named_shortage,
+    publish,
+    sha256,
+    to_disk,
+)
 from polarnet.runtime.sections import section, section_of
 from polarnet.storage.groups import REPAIR, GrowingColumns, is_url, open_group, raise_unreadable
 
@@ -215,14 +224,15 @@ class Store:
                 f"{self.path}: {len(missing)} not written yet: {', '.join(missing[:8])}; write them, then finish"
             )
         header = {**self.header, "digests": {part: _digest(self._url(part, METADATA)) for part in self.parts}}
+        if not is_url(self.path):
+            for leftover in [*Path(self.path).glob("*.tmp"), *Path(self.path).glob("*.partial")]:  # of killed processes
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+            to_disk(Path(self.path))  # takes seconds, in which the header still lets a rerun go on
         with named_shortage(Path(self.path)):
             zarr.open_group(self.path, mode="r+").attrs.put({**header, "checksum": _checksum(header)})
-        if is_url(self.path):
-            return
-        for leftover in [*Path(self.path).glob("*.tmp"), *Path(self.path).glob("*.partial")]:  # of killed processes
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-        publish(Path(self.path), Path(self.path.removesuffix(".tmp")))
-        self._claim.close()
+        if not is_url(self.path):
+            publish(Path(self.path), Path(self.path.removesuffix(".tmp")))
+            self._claim.close()
 
     def record(self, sequence: str) -> Header:
         """Record of a stored sequence, with [start, stop] of its `rows`; ValueError if unreadable."""
