@@ -15,7 +15,7 @@ from torch import Tensor
 from polarnet.events.stream import MAX_SIDE, Events, slice_count, slice_time, validate
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG
 from polarnet.storage.groups import REPAIR
-from polarnet.storage.parts import Store
+from polarnet.storage.parts import Header, Store
 
 MAX_DURATION_US = 2**32 - 1  # 71 minutes: t is uint32
 INDEX_STEP = 2**14  # events
@@ -167,6 +167,17 @@ class EventStore(Store):
             return [*map(validate, channels)]
         except ValueError as error:
             raise ValueError(f"{self.path}: {sequence}: {error}; {REPAIR}") from None
+
+    def check_record(self, sequence: str, record: Header) -> None:
+        """ValueError for a record that no writer makes, such as a duration above 71 minutes."""
+        super().check_record(sequence, record)
+        offsets, (start, stop), duration_us = record["offsets"], record["rows"], record["duration_us"]
+        spans = len(offsets) == NUM_CHANNELS + 1 and offsets == sorted([0, *offsets[1:-1], stop - start])
+        steps = [-(-int(count) // INDEX_STEP) for count in np.diff(offsets)]
+        if not (spans and [*map(len, record["index"])] == steps and 0 < duration_us <= MAX_DURATION_US):
+            raise ValueError(
+                f"{sequence}: expected offsets of {stop - start} events, got {offsets} in {duration_us} us"
+            )
 
     def _check(self, channels: Sequence[Events], duration_us: int) -> None:
         if len(channels) != NUM_CHANNELS:

@@ -297,6 +297,12 @@ class Store:
         files, name = fsspec.url_to_fs(self._url(part, METADATA))
         return files.exists(name)
 
+    def check_record(self, sequence: str, record: Header) -> None:
+        """ValueError for a record that no writer makes."""
+        start, stop = record["rows"]
+        if not 0 <= start <= stop:
+            raise ValueError(f"{sequence}: expected a span of rows, got {start} to {stop}")
+
     def _url(self, *names: str) -> str:
         """Path or fsspec URL of a part, or of a file of a part."""
         return "/".join((self.path, *names))
@@ -312,6 +318,8 @@ class Store:
                 group = open_group(self._url(part))
                 written: Any = group.attrs["sequences"]
                 records = {name: dict(written[name]) for name in self.parts[part]}
+                for name, record in records.items():
+                    self.check_record(name, record)
                 self._opened[key] = group, records, {}
             except Exception as error:  # Zarr raises many kinds of exceptions
                 raise_unreadable(error, f"{self.path}: {sequence}, {part}")

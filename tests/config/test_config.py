@@ -275,3 +275,27 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
     (tmp_path / "params.yaml").write_text("\n".join([*lines, f"last: {last}\n"]))
     with pytest.raises(ValueError, match=r"params\.yaml is not a file of values: expected at most 10000 values"):
         check_overrides(Config, tmp_path, [])
+
+
+def test_a_typo_in_params_yaml_is_refused_with_the_keys_there_are(project):
+    edit(project, "  mse: 10.0\n  ssim: 1.0", "  mse: 10.0\n  sim: 1.0")
+    with pytest.raises(ValueError, match=r"loss\.sim is not a setting; loss has half_weight, lpips, mse, ssim"):
+        load(project)
+
+
+E2P = "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}"
+
+
+def test_the_paper_experiment_holds_the_papers_values(project_root):
+    config = load(project_root, ["experiment=paper"])
+    assert (config.ingest.height, config.ingest.width) == (400, 600)
+    assert (config.synthesize.sensor_height, config.synthesize.sensor_width) == (120, 180)
+    assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
+    assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
+    assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
+    assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
+    assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
+    assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
+    assert config.used_baselines == ["e2v"]  # E2P is trained only if a row asks for it
+    with_e2p = load(project_root, ["experiment=paper", "baselines.trained=[e2p]", "~rows.e2v", E2P])
+    assert with_e2p.used_baselines == ["e2p"]

@@ -5,14 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
 from simulation_fixtures import REST, STILL
 from skimage import data
 
-from polarnet.events.stream import validate
+from polarnet.events.stream import concatenate, validate
 from polarnet.simulation.camera import IDEAL, Camera, weights_of
 from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import Pose, Sine, Trajectory, render, resting_trajectory
 from polarnet.simulation.moving_sensor import (
+    channel_light,
     check_inside,
     emulate_motion,
     emulate_motion_steps,
@@ -55,6 +57,14 @@ def test_a_drifting_sensor_sees_what_render_sees(scene):
         assert rendered.reshape(-1, H, W) / 255 == pytest.approx(expected[:, polarizer].numpy() / 255, abs=1e-5)
 
 
+def test_a_turning_sensor_sees_what_render_sees_with_polarizers_that_turn_along(scene):
+    t_us, turning = times_us(31), trajectory(roll=0.3, zoom=0.2)
+    stokes = render(scene, turning, t_us * 1e-6, H, W)
+    expected = 255 * intensities_from_stokes(stokes).transpose(0, 1).numpy()
+    light = channel_light(stokes.transpose(0, 1).numpy(), IDEAL, weights_of(IDEAL, H, W, 0))
+    assert light == pytest.approx(np.maximum(expected, 0), abs=255e-5)
+
+
 @pytest.mark.parametrize("model", ["v2e", "exact"])
 @pytest.mark.parametrize("turning", [False, True])
 def test_events_are_those_of_the_rendered_clip(scene, model, turning):
@@ -71,6 +81,21 @@ def test_events_are_those_of_the_rendered_clip(scene, model, turning):
         # light that differs in its last bit moves few stamps by a microsecond, and fewer pixels across a rounding
         assert len(a & b) > 0.97 * len(b)
         assert len(ours) == pytest.approx(len(theirs), rel=2e-3)
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+@pytest.mark.parametrize("turning", [False, True])
+def test_a_sequence_in_pieces_or_on_two_threads_has_the_same_bytes(scene, model, turning):
+    path, config = trajectory(roll=0.3 * turning, zoom=0.2 * turning), dataclasses.replace(CONFIG, model=model)
+    camera = Camera(config, key=5)
+    whole = emulate_motion(camera, scene, path, 200_000, (H, W))
+    threaded = emulate_motion(camera, scene, path, 200_000, (H, W), threads=2)
+    assert all(equal(a, b) for a, b in zip(whole, threaded, strict=True))
+    t_us, state, pieces = render_times_us(path, 200_000, H, W, config), None, []
+    for first in range(0, len(t_us), 23):
+        events, state = emulate_motion_steps(camera, scene, path, t_us[first : first + 23], (H, W), state)
+        pieces.append(events)
+    assert all(equal(concatenate(parts), all_) for parts, all_ in zip(zip(*pieces, strict=True), whole, strict=True))
 
 
 def test_v2e_renders_at_regular_times_and_at_the_end():

@@ -175,6 +175,20 @@ def test_a_pixel_is_valid_unless_its_interpolation_uses_a_masked_one(x, y, expec
     assert [tuple(place) for place in (~seen).nonzero().tolist()] == expected
 
 
+def test_the_mask_of_a_turning_window_is_that_of_its_weights():
+    """Light from masked pixels alone: what a valid pixel shows does not change when they do."""
+    generator = torch.Generator().manual_seed(1)
+    light = torch.rand(3, 60, 80, generator=generator)
+    valid = torch.rand(60, 80, generator=generator) < 0.98
+    trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
+    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], Grid(24, 36))
+    t_s = np.array([0, 0.05, 0.1])
+    changed = torch.where(valid, light, light + 1)
+    before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
+    assert torch.equal(rendered, before == after)
+    assert 0.8 < rendered.float().mean() < 0.98
+
+
 @pytest.mark.parametrize("crosstalk", [0.0, 0.2])
 def test_a_cell_is_valid_unless_its_truth_or_light_changes_with_masked_pixels(crosstalk):
     polarizers = dataclasses.replace(IDEAL, layout="dofp", crosstalk=crosstalk)

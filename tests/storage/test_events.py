@@ -205,3 +205,22 @@ def test_events_that_no_writer_accepts_are_refused_when_they_are_read(tmp_path, 
     for span in ((), (0, 500)):
         with pytest.raises(ValueError, match=rf"events\.zarr: a: event 1 of 2: {message}"):
             EventStore.open(tmp_path / "events.zarr").read("a", *span)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"duration_us": 10**15},
+        {"offsets": [0, 2, 1, 3, 4]},
+        {"offsets": [0, 4]},
+        {"rows": [-4, 0]},
+        {"index": []},
+    ],
+)
+def test_a_record_that_no_writer_makes_is_refused(tmp_path, record):
+    store = EventStore.create(tmp_path / "events.zarr", ["a"], 40, 60, {})
+    one = Events(*torch.ones(1, 1).long(), *torch.ones(2, 1).short(), torch.ones(1).to(torch.int8), 40, 60)
+    store.write("a", [one] * 4, 1000)
+    known = store.record("a")
+    with pytest.raises(ValueError, match=r"a: expected (offsets|a span)"):
+        store.check_record("a", {**known, **record})
