@@ -9,6 +9,8 @@ mean; then means over scenes:
 - `ours`: the shipped weights; `ours, true offset`: with the true median offset of atanh(s1) and atanh(s2) in each
   frame.
 - `panorama, true offset`: `register` on all windows of a recording, with the one true offset of the whole recording.
+- `panorama, true offset of lines`: a scene that moves straight is compared with itself along its motion alone, so each
+  line along the motion has an offset of its own; this row has all of them, 4 pixels apart.
 - `panorama, solved`: the same with the offset that the redundancy I0 + I90 = I45 + I135 gives (`redundant_offset`).
 - `offset`: mean squared offset of `ours`, a figure without truth of anything but polarization.
 
@@ -16,7 +18,8 @@ mean; then means over scenes:
 their motion in turns. With L the images, P_k the bilinear view of the sensor at time k, N the ON and OFF events of a
 pixel so far, c the thresholds and b a pixel's unknown start: P_k L - b = g_on c N_on(k) - g_off c N_off(k) + noise. The
 thresholds' errors g ~ N(1, mismatch) and b are integrated out at each pixel, so L is one linear problem, solved by
-conjugate gradients.
+conjugate gradients. The covariance of a pixel comes from the events of the other three channels: with its own events,
+whose noise it shares, contrasts shrink to half.
 """
 
 import statistics
@@ -44,13 +47,16 @@ from studies.study import arguments_of, command_line, machine_record, write_sect
 THRESHOLD = 0.2  # change of natural-log intensity per event
 MISMATCH = 0.15  # relative standard deviation of a pixel's threshold
 ROUNDING = 1 / 6  # variance of a sum of events, in squared thresholds, because changes below a threshold are not seen
-SLOPE_WEIGHT = 0.01  # of the squared slopes of the images, a weak prior where nothing was seen
+SLOPE_WEIGHT = 0.01  # of the squared slopes of the images' mean, a weak prior where nothing was seen
+MIXING = np.array([[1, 1, 1, 1], [2**0.5, 0, -(2**0.5), 0], [0, 2**0.5, 0, -(2**0.5)], [1, -1, 1, -1]], np.float32) / 2
+CONTRAST_WEIGHT = 50  # of the squared slopes of the other three rows of MIXING, relative to those of the mean
 REACH = 12  # pixels per window of the motion search
 MARGIN = 4  # pixels round the panorama, for corrections of the motion
 ROUNDS = (20, 10, 10, 10, 10)  # conjugate-gradient iterations on 2x2 blocks; the motion is corrected between them
 LAST_ITERATIONS = 25  # on all pixels
 MAX_MOVE = 1.0  # limit in pixels of one correction of the motion
 BLOCKS_MISMATCH, BLOCKS_ROUNDING = 0.6, 0.5  # of 2x2 blocks, relative to single pixels
+LINE = 4  # pixels, width of a line along the motion
 MAX_S = 0.98
 FLOOR = 1e-3
 
@@ -116,9 +122,9 @@ def _even(length: float) -> int:
     return 2 * int(np.ceil(length / 2))
 
 
-def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Float32[np.ndarray, "c 3 k h w"]:
+def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Float32[np.ndarray, "4 3 k h w"]:
     """Orthonormal series of each pixel, shrunk; the inverse covariance is that of `_weigh`, which subtracts them."""
-    steps = THRESHOLD * events
+    steps = THRESHOLD * (events.sum(0) - events) / 3  # the other channels see nearly the same, with errors of their own
     series = np.stack([np.ones_like(steps[:, 0]), steps[:, 0], steps[:, 1]], axis=1)
     gram = np.einsum("cmkij,cnkij->cijmn", series, series, optimize=True).astype(np.float64)
     prior = rounding * THRESHOLD**2 / mismatch**2
@@ -151,7 +157,7 @@ def _solved(
     """Conjugate gradients for the images, with the coverage as preconditioner."""
     slopes = np.float32(SLOPE_WEIGHT * noise / ROUNDING)
     seen = _coverage(x, y, events.shape[-2:], start.shape[-2:])
-    inverse = 1 / (seen + 4 * slopes + np.float32(1e-5))
+    inverse = 1 / (seen + slopes * (1 + 3 * CONTRAST_WEIGHT) + np.float32(1e-5))
     buffer = _changes(events)
 
     def applied(images: np.ndarray) -> np.ndarray:
@@ -168,14 +174,14 @@ def _solved(
     images = start.copy()
     residual = target - applied(images)
     step = inverse * residual
-    direction, power = step.copy(), (residual * step).sum((1, 2), keepdims=True)
+    direction, power = step.copy(), (residual * step).sum()
     for _ in range(iterations):
         moved = applied(direction)
-        length = power / (direction * moved).sum((1, 2), keepdims=True).clip(min=1e-20)
+        length = power / (direction * moved).sum().clip(min=1e-20)
         images += length * direction
         residual -= length * moved
         step = inverse * residual
-        after = (residual * step).sum((1, 2), keepdims=True)
+        after = (residual * step).sum()
         direction = step + after / power.clip(min=1e-20) * direction
         power = after
     return images
@@ -254,10 +260,12 @@ def _weigh(values, series):
 
 
 def _add_slopes(images: np.ndarray, weight: np.float32, out: np.ndarray) -> None:
-    """The gradient of half the squared slopes, times a weight, added to `out`."""
+    """The gradient of half the squared slopes of mean and contrasts, times their weights, added to `out`."""
+    mixed = np.tensordot(MIXING, images, 1)
+    mixed[1:] *= CONTRAST_WEIGHT
     none = np.float32(0)
-    for axis in (1, 2):
-        out -= weight * np.diff(np.diff(images, axis=axis), axis=axis, prepend=none, append=none)
+    bends = sum(np.diff(np.diff(mixed, axis=axis), axis=axis, prepend=none, append=none) for axis in (1, 2))
+    out -= weight * np.tensordot(MIXING.T, bends, 1)
 
 
 def redundant_offset(panorama: Panorama) -> Float64[np.ndarray, " 2"]:
@@ -279,6 +287,22 @@ def contrasts(panorama: Panorama, size: tuple[int, int], first: int) -> Float32[
     images = panorama.images - panorama.images[:, panorama.seen].mean(1)[:, None, None]
     x, y = panorama.x[first:], panorama.y[first:]
     return views((images[:2] - images[2:]) / 2, x, y, size)
+
+
+def offset_of_lines(
+    panorama: Panorama, error: Float64[np.ndarray, "2 k h w"], valid: Bool[np.ndarray, "k h w"], first: int
+) -> Float64[np.ndarray, "2 k h w"]:
+    """Median of `error` on each line along the main direction of the motion, `LINE` pixels wide."""
+    path = np.stack([panorama.x, panorama.y], axis=1)
+    across = np.linalg.svd(path - path.mean(0), full_matrices=False)[2][1]
+    rows, columns = np.indices(error.shape[-2:])
+    at = [x[first:, None, None] + axis for x, axis in ((panorama.x, columns), (panorama.y, rows))]
+    line = np.floor((across[0] * at[0] + across[1] * at[1]) / LINE).astype(int)
+    line -= line.min()
+    medians = np.zeros((2, line.max() + 1))
+    for number in np.unique(line[valid]):
+        medians[:, number] = np.median(error[:, (line == number) & valid], axis=1)
+    return medians[:, line]
 
 
 def _contrasts_of(dolp: np.ndarray, aolp: np.ndarray) -> np.ndarray:
@@ -319,6 +343,7 @@ def errors_of(test: TestSequence, first: int) -> dict[str, float]:
         "ours": mean_error(ours.dolp[first:].clamp(0, 1).numpy()),
         "ours, true offset": mse(own + moves[..., None, None]),
         "panorama, true offset": mse(found + true_offset[:, None, None, None]),
+        "panorama, true offset of lines": mse(found + offset_of_lines(panorama, truth - found, valid, first + 1)),
         "panorama, solved": mse(found + redundant_offset(panorama)[:, None, None, None]),
         "offset": float(np.square(moves).mean()),
     }
