@@ -90,7 +90,10 @@ def records_of(root: Path) -> dict[str, Any]:
         for section, record in json.loads(path.read_text(encoding="utf-8")).get("records", {}).items():
             units = record.get("bf16_units", [])  # older records do not have them
             versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-            machine = {key: record[key] for key in ("machine", "cores")} | {"units": units or None, "versions": versions}
+            machine = {key: record[key] for key in ("machine", "cores")} | {
+                "units": units or None,
+                "versions": versions,
+            }
             key = json.dumps(machine)
             if key not in letters:
                 letters[key] = chr(ord("A") + len(letters))

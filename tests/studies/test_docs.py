@@ -113,7 +113,7 @@ def test_machines_and_loads_of_all_measurements_are_listed(project):
     [
         ("photographs_large", "firenet_published+gain", "train_mean"),
         ("measured", "firenet_published+gain", "constant_real"),
-        ("sensors.randomised", "highpass+gain", "train_mean"),
+        ("sensors.noisy", "firenet_published+gain", "train_mean"),
     ],
 )
 def test_the_best_method_and_constant_of_the_readme_are_the_best(project_root, scenes, method, constant):
