@@ -37,7 +37,9 @@ class Value:
     def __init__(self, value: Any):
         self.value = value
 
-    def __getitem__(self, key: str) -> "Value":
+    def __getitem__(self, key: str | int) -> "Value":
+        if isinstance(self.value, list):
+            return Value(self.value[int(key)])
         return Value(self.value.get(key) if isinstance(self.value, Mapping) else None)
 
     def __format__(self, form: str) -> str:
