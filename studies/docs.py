@@ -85,23 +85,21 @@ def read_file(root: Path, name: str) -> dict[str, Any]:
 
 
 def records_of(root: Path) -> dict[str, Any]:
-    """`measured`, a record for each section of docs/results/*.json, and `machines`, which they name by letter."""
-    letters: dict[str, str] = {}
-    machines, records = [], []
+    """`machines`, each with a letter, and `measured`: by file of docs/results, its sections with machine and commit."""
+    machines: dict[str, dict[str, Any]] = {}
+    measured = {}
     for path in sorted((root / "docs" / "results").glob("*.json")):
+        sections = []
         for section, record in json.loads(path.read_text(encoding="utf-8")).get("records", {}).items():
-            units = record.get("bf16_units", [])  # older records do not have them
             versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-            machine = {key: record[key] for key in ("machine", "cores")} | {
-                "units": units or None,
-                "versions": versions,
-            }
-            key = json.dumps(machine)
-            if key not in letters:
-                letters[key] = chr(ord("A") + len(letters))
-                machines.append({"letter": letters[key], **machine})
-            records.append({"file": path.stem, "section": section, "on": letters[key], **record})
-    return {"machines": machines, "measured": records}
+            units = record.get("bf16_units") or None  # older records do not have them
+            machine = {"machine": record["machine"], "cores": record["cores"], "units": units, "versions": versions}
+            letter = chr(ord("A") + len(machines))
+            letter = machines.setdefault(json.dumps(machine), {"letter": letter, **machine})["letter"]
+            sections.append(f"{section}: {letter}, load {record['load']:.1f}, `{record['commit'][:10]}`")
+        if sections:
+            measured[path.stem] = "<br>".join(sections)
+    return {"machines": list(machines.values()), "measured": measured}
 
 
 def block_text(table: Mapping[str, Any], results: Results) -> str:
