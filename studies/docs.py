@@ -2,13 +2,15 @@
 
 A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`. docs/tables.yaml describes each block:
 
-- `file`: NAME of docs/results/NAME.json, or a YAML file below docs/ (its list is `entries`);
-- `section`: the part of the file whose machine and commit the block names (the whole file if it is left out);
+- `file`: NAME of docs/results/NAME.json; a YAML file below docs/ (its list is `entries`); or `records`, for the
+  machines and commits of all measurements;
+- `section`: the part of the file whose commit the block names (the whole file if it is left out);
 - `rows`: a path such as `test/tables` to a mapping (a row for each entry, whose key is `name`) or to a list; or a
   mapping from `label` to `name`, for rows that are chosen by hand;
+- `without`: values by key; a row that has all of them is left out;
 - `columns`: a format string for each heading, over the row's values and the whole file. `$name` and `$label` are
   replaced before, so `{test[$name][mse]:.4f}` looks into the file. A missing value is printed as "-";
-- `caption`: a format string over the whole file; `{origin}` names machine, versions and commit.
+- `caption`: a format string over the whole file; `{origin}` names the commit.
 """
 
 import argparse
@@ -24,7 +26,7 @@ from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
-KEYS = {"file", "section", "rows", "columns", "caption"}
+KEYS = {"file", "section", "rows", "without", "columns", "caption"}
 
 Results = Mapping[str, Any]
 
@@ -35,7 +37,9 @@ class Value:
     def __init__(self, value: Any):
         self.value = value
 
-    def __getitem__(self, key: str) -> "Value":
+    def __getitem__(self, key: str | int) -> "Value":
+        if isinstance(self.value, list):
+            return Value(self.value[int(key)])
         return Value(self.value.get(key) if isinstance(self.value, Mapping) else None)
 
     def __format__(self, form: str) -> str:
@@ -71,11 +75,31 @@ def read_tables(root: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_file(root: Path, name: str) -> dict[str, Any]:
-    """Content of docs/results/NAME.json, or the list `entries` of a YAML file below docs/; empty if there is none."""
+    """Content of docs/results/NAME.json, `entries` of a YAML file below docs/, or `records`; empty if there is none."""
+    if name == "records":
+        return records_of(root)
     if name.endswith(".yaml"):
         return {"entries": YAML(typ="safe").load(root / "docs" / name)}
     path = root / "docs" / "results" / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def records_of(root: Path) -> dict[str, Any]:
+    """`machines`, each with a letter, and `measured`: by file of docs/results, its sections with machine and commit."""
+    machines: dict[str, dict[str, Any]] = {}
+    measured = {}
+    for path in sorted((root / "docs" / "results").glob("*.json")):
+        sections = []
+        for section, record in json.loads(path.read_text(encoding="utf-8")).get("records", {}).items():
+            versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
+            units = record.get("bf16_units") or None  # older records do not have them
+            machine = {"machine": record["machine"], "cores": record["cores"], "units": units, "versions": versions}
+            letter = chr(ord("A") + len(machines))
+            letter = machines.setdefault(json.dumps(machine), {"letter": letter, **machine})["letter"]
+            sections.append(f"{section}: {letter}, load {record['load']:.1f}, `{record['commit'][:10]}`")
+        if sections:
+            measured[path.stem] = "<br>".join(sections)
+    return {"machines": list(machines.values()), "measured": measured}
 
 
 def block_text(table: Mapping[str, Any], results: Results) -> str:
@@ -85,12 +109,19 @@ def block_text(table: Mapping[str, Any], results: Results) -> str:
         return "Not measured yet."
     parts = []
     if "columns" in table:
-        parts.append(markdown(table["columns"], list(rows_of(table["rows"], results)), results))
+        parts.append(markdown(table["columns"], kept_rows(table, results), results))
     record = results.get("records", {}).get(section) or results
-    origin = origin_of(record) if "machine" in record else ""
+    origin = f"Commit `{record['commit'][:10]}`." if "commit" in record else ""
     if caption := table.get("caption", "{origin}").format_map(Values({**results, "origin": origin})):
         parts.append(caption.strip())
     return "\n\n".join(parts)
+
+
+def kept_rows(table: Mapping[str, Any], results: Results) -> list[dict[str, Any]]:
+    """The rows of a table but for those that its key `without` leaves out."""
+    unwanted = table.get("without", {})
+    rows = rows_of(table["rows"], results)
+    return [row for row in rows if not unwanted or any(row.get(key) != value for key, value in unwanted.items())]
 
 
 def rows_of(rows: str | Mapping[str, str], results: Results) -> Iterator[dict[str, Any]]:
@@ -117,18 +148,6 @@ def _cell(form: str, row: Mapping[str, Any], results: Results) -> str:
     named = Template(form).safe_substitute(name=row["name"], label=row["label"])
     text = " ".join(named.format_map(Values({**results, **row})).split())
     return "-" if text.startswith("- ") else text  # a unit behind a missing value says nothing
-
-
-def origin_of(record: Mapping[str, Any]) -> str:
-    """The sentence below a table: number of cores, machine, load, versions and commit of a measurement.
-
-    `record` is that of `studies.study.machine_record`.
-    """
-    cores = "one core" if record["cores"] == 1 else f"{record['cores']} cores"
-    versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-    units = " and ".join(record.get("bf16_units", ()))  # older records do not have them
-    where = f"{record['machine']}{units and f' with {units}'}, load {record['load']:.1f} before the start"
-    return f"On {cores} ({where}; {versions}; commit `{record['commit'][:10]}`)."
 
 
 def update_pages(root: Path, check: bool) -> list[Path]:

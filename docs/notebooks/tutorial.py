@@ -14,11 +14,7 @@ from dataclasses import replace
 
 import matplotlib.pyplot as plt
 
-from polarnet.events.streaming import WindowCutter, WindowRule
-from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.methods.overlap import advance, begin
-from polarnet.networks.registry import load_network
-from polarnet.networks.weights import shipped_weights
+from polarnet.recovery import recover
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, simulate
 
 # %% [markdown]
@@ -37,12 +33,7 @@ print("events behind 0, 45, 90 and 135 degrees:", [len(events) for events in res
 # The network sees windows of 1/30 s. It carries a state from one window to the next.
 
 # %%
-height, width = result.dolp.shape[-2:]
-recoverer = dolp_recoverer(*load_network(shipped_weights()), device="cpu")
-cutter = WindowCutter(WindowRule(length_us=33_333, events=None, step_us=None), height, width)
-history = begin(recoverer, height, width)
-for window in cutter.add(result.events, int(result.t_us[-1])):
-    history, prediction = advance(recoverer, history, [window])
+prediction = recover(result.events, t_us=result.t_us).prediction
 
 # %% [markdown]
 # ## Compare
@@ -51,9 +42,9 @@ for window in cutter.add(result.events, int(result.t_us[-1])):
 
 # %%
 figure, panels = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
-for axes, name, dolp in zip(panels, ("true", "recovered"), (result.dolp[-1], prediction.dolp[0]), strict=True):
+for axes, name, dolp in zip(panels, ("true", "recovered"), (result.dolp[-1], prediction.dolp[-1]), strict=True):
     axes.imshow(dolp, vmin=0, vmax=1)
     axes.set_title(f"{name} DoLP")
     axes.axis("off")
-rms = float((prediction.dolp[0] - result.dolp[-1]).square().mean().sqrt())
+rms = float((prediction.dolp[-1] - result.dolp[-1]).square().mean().sqrt())
 print(f"RMS error of DoLP: {rms:.3f}")

@@ -195,7 +195,7 @@ def test_every_preset_composes_holds_only_what_differs_and_no_sensor_is_called_l
 
 @pytest.mark.thorough
 def test_every_ablation_is_accepted_on_the_command_line_and_changes_something(project_root):
-    experiment = "experiment=photographs"  # docs/network.md sweeps over its ablations
+    experiment = "experiment=photographs"  # docs/attempts.md sweeps over its ablations
     whole = load(project_root, [experiment])
     names = preset_names(project_root, "ablation")
     assert "nothing" in names

@@ -115,12 +115,14 @@ def unused_deps(trace: Trace, stage: Stage) -> list[str]:
 
 
 def table_of(stages: dict[str, Stage]) -> str:
-    """Markdown table of the stages that depend on each folder, artefact and section; all rows count as one."""
-    rows: dict[str, list[str]] = {}
+    """Markdown table of the code, the data and the sections of params.yaml that each stage reads; all rows are one."""
+    used: dict[str, tuple[set[str], set[str], set[str]]] = {}
     for name, stage in stages.items():
-        for used in (*stage.deps, *(key.partition(".")[0] for key in stage.params)):
-            short = f"{name.partition('@')[0]}" if used.startswith(("polarnet", "data")) or "@" not in name else name
-            if used != "data/images" and not used.startswith("stages/") and short not in rows.setdefault(used, []):
-                rows[used].append(short)
-    lines = [f"| `{used}` | {', '.join(names)} |" for used, names in sorted(rows.items())]
-    return "\n".join(["| a change of | runs again |", "|---|---|", *lines])
+        code, data, sections = used.setdefault(name.partition("@")[0], (set(), set(), set()))
+        code |= {dep.removeprefix("polarnet/") for dep in stage.deps if dep.startswith("polarnet/")}
+        data |= {dep.removeprefix("data/") for dep in stage.deps if dep.startswith("data/")}
+        sections |= {key.partition(".")[0] for key in stage.params}
+    cells = [[", ".join(f"`{one}`" for one in sorted(kind)) for kind in kinds] for kinds in used.values()]
+    lines = [f"| `{name}` | {' | '.join(kinds)} |" for name, kinds in zip(used, cells, strict=True)]
+    head = "| stage | code below `polarnet/` | files below `data/` | sections of `params.yaml` |"
+    return "\n".join([head, "|---|---|---|---|", *lines])
