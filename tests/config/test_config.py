@@ -50,7 +50,10 @@ def edit(project: Path, old: str, new: str) -> None:
         ("loss.msee=1.0", r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"),
         ("seed.x=1", r"seed\.x is not a setting; seed is a value, not a section"),
         ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photog"),
-        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has celex5, clean, .*, random$"),
+        (
+            "sensor=noizy",
+            r"sensor: there is no 'noizy'; conf/sensor has celex5, clean, .*, random; did you mean 'noisy'\?$",
+        ),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
         ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
