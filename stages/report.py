@@ -2,10 +2,12 @@
 
 import dataclasses
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
+from polarnet.config.experiments import changed_values
 from polarnet.config.pipeline import set_folder
 from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
@@ -22,6 +24,14 @@ def plain(value: Any) -> Any:
     return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
 
 
+def command_line(root: Path) -> str:
+    """The command that makes the page again, with the values that differ from the commit's."""
+    if "DVC_STAGE" not in os.environ:
+        return shlex.join(["python", "-m", "stages.report", *(w for w in sys.argv[1:] if not w.startswith("hydra."))])
+    changes = [word for change in changed_values(root) for word in ("-S", change)]
+    return shlex.join(["dvc", "exp", "run", *changes]) if changes else "dvc repro"
+
+
 @hydra_stage
 def main(config: Config) -> None:
     """Put the tables together from the rows of `benchmark.methods`, write the report and print its location."""
@@ -33,9 +43,8 @@ def main(config: Config) -> None:
     shown = [field.name for field in dataclasses.fields(config) if field.name not in PLUMBING]
     parameters = {name: plain(getattr(config, name)) for name in shown}
     parameters["networks"] = {config.network: plain(config.network_config)}
-    overrides = [override for override in sys.argv[1:] if not override.startswith("hydra.")]
-    command = "dvc repro" if "DVC_STAGE" in os.environ else " ".join(["python -m stages.report", *overrides])
-    run = Run(command, parameters, {"seed": str(config.seed)} | facts(Path(__file__).resolve().parent.parent))
+    root = Path(__file__).resolve().parent.parent
+    run = Run(command_line(root), parameters, {"seed": str(config.seed)} | facts(root))
     print(f"the report: {write_report(paths, config.used_baselines, run, Path(config.paths.report))}")
 
 

@@ -18,8 +18,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import av
 from PIL import Image
 
+from studies.simulation_pictures import COLOURS
 from studies.study import (
     PICTURES,
     ROOT,
@@ -82,9 +84,13 @@ def draw_pictures() -> None:
         subprocess.run([sys.executable, "-m", f"studies.{module}"], cwd=ROOT, check=True)
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "polarnet.cli", "demo", "--out", folder], cwd=ROOT, check=True)
-        for name, file in (("simulate", "simulated/preview.png"), ("recover", "recovered/recovered.png")):
-            with Image.open(Path(folder, file)) as picture:
-                picture.convert("RGB").quantize().save(PICTURES / f"{name}.png", optimize=True)
+        with Image.open(Path(folder, "simulated", "preview.png")) as preview:
+            pictures = {"simulate": preview.convert("RGB")}
+        with av.open(str(Path(folder, "recovered", "recovered.mp4"))) as video:
+            *_, last = video.decode(video=0)
+        pictures["recover"] = last.to_image()
+        for name, picture in pictures.items():
+            picture.quantize(COLOURS).save(PICTURES / f"{name}.png", optimize=True)
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 Every point, line and event in them comes from the simulation itself; where a formula is drawn, its label says so.
 """
 
+import functools
 import json
 import math
 from dataclasses import replace
@@ -19,7 +20,7 @@ from polarnet.reports.maps import dolp_image
 from polarnet.simulation.pixels.light import respond
 from polarnet.simulation.pixels.physics import physics_of
 from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities
-from studies.simulation_pictures import LINE, ON, QUIET, drawn, events_under, photograph, write_pictures
+from studies.simulation_pictures import LINE, ON, QUIET, drawn, events_under, few_colours, photograph, write_pictures
 from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
@@ -119,4 +120,8 @@ FIGURES = {
 
 
 if __name__ == "__main__":
-    write_pictures(FIGURES, "Draw the pictures of docs/physics.md and docs/theory-*.md.", PALETTE)
+    write_pictures(
+        FIGURES,
+        "Draw the pictures of docs/physics.md and docs/theory-*.md.",
+        functools.partial(few_colours, colours=PALETTE),
+    )

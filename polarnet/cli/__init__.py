@@ -1,6 +1,7 @@
 """The `polarnet` command. A command is a function of a module here, which is imported when the command runs."""
 
 import argparse
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -22,28 +23,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
         announce_interrupts()
     let_threads_sleep()
     silence_bindings()
-    options = parse(arguments)
-    module, _, function = options.run.partition(".")
+    words = sys.argv[1:] if arguments is None else arguments
     try:
+        options = parse(words)
+        options.parser.check_inputs(options)
+        module, _, function = options.run.partition(".")
         status: int | None = getattr(import_module(f"polarnet.cli.{module}"), function)(options)
     except (ValueError, OSError, RuntimeError, MemoryError) as error:
-        print(f"polarnet {options.command}: {error or type(error).__name__}", file=sys.stderr)
+        print(f"polarnet {words[0]}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         warnings.simplefilter("ignore", RuntimeWarning)  # about a call of Zarr that was to start
-        print(f"polarnet {options.command}: {STOPPED}", file=sys.stderr)
+        print(f"polarnet {words[0]}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
     return status or 0
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The arguments; words KEY=VALUE behind the options of a command with overrides count as overrides."""
-    parser, words = command_parser(), sys.argv[1:] if arguments is None else arguments
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """The arguments; words KEY=VALUE behind the options of a command with overrides count as overrides.
+
+    `command_line` of the result is the whole command, as typed in a shell.
+    """
+    parser = command_parser()
     if strange := [word for word in words if any("\ud800" <= character <= "\udfff" for character in word)]:
         parser.error(f"{strange[0]!a}: expected a name in UTF-8; rename the file")
     options, rest = parser.parse_known_args(words)
     if rest and (not hasattr(options, "overrides") or any(w.startswith("-") or "=" not in w for w in rest)):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        options.parser.refuse(rest)
     if rest:
         options.overrides = [*options.overrides, *rest]
+    options.command_line = shlex.join(["polarnet", *words])
     return options

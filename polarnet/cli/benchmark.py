@@ -22,9 +22,9 @@ from polarnet.cli.outputs import MARKER, WORK, run_folder
 from polarnet.cli.project import project_root, settings_root, working_folder
 from polarnet.cli.studies import STUDIED, run_event_budget
 from polarnet.config.pipeline import context_of, made_set
-from polarnet.config.tree import Config, load, with_lpips
+from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import NO_RECORD, find_weights
+from polarnet.metrics.lpips import NO_RECORD, Weights, find_weights, installed_version
 from polarnet.metrics.similarity import Lpips
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
@@ -81,12 +81,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
-    if options.weights is not None and not options.weights.is_file():
-        raise ValueError(
-            f"--weights {options.weights}: expected a checkpoint of the DoLP network (.safetensors), found no such file"
-        )
     source = "--scenes" if options.scenes else "--recordings"
-    weights = with_lpips(config, "benchmark", find_weights)  # the pipeline need not have found them before
+    weights, without_lpips = _lpips_weights(config)
     lpips = None if weights is None else Lpips.of(weights.backbone, weights.tensors)
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
@@ -96,7 +92,8 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     if options.recordings:
         left_out |= {row: NOT_ROTATING for row in methods if is_rotating(row)}
         methods = [row for row in methods if row not in left_out]
-    settings, work = dataclasses.replace(config.benchmark, methods=methods), options.out / WORK / "set"
+    settings = dataclasses.replace(config.benchmark, methods=methods, lpips=lpips is not None)
+    work = options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
             used = conditions(config.synthesize, config.emulate)
@@ -106,7 +103,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         else:
             used, about = {}, RECORDED_SENTENCE
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
-        notes += [f"{row} was left out: {reason}." for row, reason in left_out.items()]
+        notes += [*without_lpips, *(f"{row} was left out: {reason}." for row, reason in left_out.items())]
         rotating = None
         if any(map(is_rotating, methods)):
             rotating, mapper = work.with_name("rotating.zarr"), config.mapper("emulate_rotating")
@@ -127,9 +124,19 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             "left_out": notes,
         }
         write_benchmark(folder, benchmark, settings, config.seed, details)
-        command = f"polarnet benchmark {source} {options.scenes or options.recordings}"
-        write_set_page(folder, test_set.name, command, notes)
+        write_set_page(folder, test_set.name, options.command_line, notes)
     return notes
+
+
+def _lpips_weights(config: Config) -> tuple[Weights | None, list[str]]:
+    """Weights of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
+    if not config.benchmark.lpips:
+        return None, []
+    try:
+        installed_version(config.benchmark.lpips_backbone)
+    except ValueError as error:
+        return None, [f"LPIPS was left out: {error}."]
+    return find_weights(config.benchmark.lpips_backbone), []
 
 
 def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:

@@ -2,14 +2,43 @@
 
 import argparse
 import functools
+import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import NoReturn, TypeAlias
 
 from polarnet import __version__
+from polarnet.terminal.suggestions import did_you_mean
 
-Command: TypeAlias = argparse.ArgumentParser
+INVALID_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
+
+
+class Command(argparse.ArgumentParser):
+    """A parser whose errors are one line that suggests a word for a mistyped one."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message and exit with status 2."""
+        if choice := INVALID_CHOICE.search(message):
+            message += did_you_mean(choice[1], re.findall(r"[\w-]+", choice[2]))
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+    def refuse(self, words: Sequence[str]) -> NoReturn:
+        """Print that these words are no arguments, and exit with status 2."""
+        option = words[0].partition("=")[0]
+        self.error(f"unrecognized arguments: {' '.join(words)}{did_you_mean(option, self._option_string_actions)}")
+
+    def check_inputs(self, options: argparse.Namespace) -> None:
+        """FileNotFoundError for an input that does not exist; a command imports its libraries for seconds after it.
+
+        URLs, standard input (-) and words KEY=VALUE are no paths.
+        """
+        values = [getattr(options, action.dest) for action in self._actions if action.type in (input_name, input_path)]
+        for name in (str(one) for value in values if value for one in (value if isinstance(value, list) else [value])):
+            if not (name == "-" or "://" in name or "=" in name or Path(name).exists()):
+                raise FileNotFoundError(f"{name}: there is no such file or folder")
+
+
 AddCommand: TypeAlias = Callable[..., Command]
 """`_command` without its first argument."""
 
@@ -19,8 +48,11 @@ _wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
 
 
 def command_parser() -> argparse.ArgumentParser:
-    """Parser of all commands; `run` of its result names the module below polarnet.cli and the function of a command."""
-    parser = argparse.ArgumentParser(
+    """Parser of all commands.
+
+    `run` of its result names the module below polarnet.cli and the function of the command, `parser` is the command's.
+    """
+    parser = Command(
         prog="polarnet",
         description="Degree of linear polarization (DoLP) from event cameras: simulation, training, benchmark and "
         "recovery. `dvc repro` runs the pipeline.",
@@ -40,6 +72,16 @@ def positive(text: str) -> float:
     return value
 
 
+def input_name(text: str) -> str:
+    """An argument that names a file or folder, which `Command.check_inputs` looks for."""
+    return text
+
+
+def input_path(text: str) -> Path:
+    """The same as a path on this machine."""
+    return Path(text)
+
+
 def _command(
     commands: "argparse._SubParsersAction[Command]",
     name: str,
@@ -55,7 +97,7 @@ def _command(
         epilog="\n  ".join(["examples:", *(f"polarnet {example}" for example in examples)]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, parser=command)
     return command
 
 
@@ -63,11 +105,11 @@ def _project(command: AddCommand) -> None:
     demo = command(
         "demo",
         "simulate.demo",
-        "a first result in a minute: simulate a built-in photograph and recover its DoLP",
+        "a first result in a minute: simulate a built-in photograph, recover its DoLP and score it",
         "demo sensor=noisy",
-        description="Simulates a camera with four polarizers that moves over a photograph, and recovers DoLP and AoLP "
-        "from its events with the shipped weights. `polarnet simulate` and `polarnet recover` do the halves, on your "
-        "own files.",
+        description="Simulates a camera with four polarizers that moves over a photograph, recovers DoLP and AoLP from "
+        "its events with the shipped weights, and scores them against the truth. `polarnet simulate` and `polarnet "
+        "recover --truth` do the halves, on your own files.",
     )
     demo.add_argument("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")
     _overrides(demo)
@@ -85,7 +127,7 @@ def _project(command: AddCommand) -> None:
         "write a project with the pipeline: dvc.yaml, params.yaml, conf, stages",
         "new lake && cd lake && polarnet preset smoke && dvc repro",
         description="Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages "
-        "run again after a change of requirements.txt, which names polarnet's version.",
+        "run again after a change of version.txt, which names polarnet's version.",
     )
     new.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
 
@@ -96,9 +138,10 @@ def _stores(command: AddCommand) -> None:
         "stores.view",
         "look at a store, a recording or a recovery in a page that plays it",
         "view data/frames.zarr --sequence lake-00",
-        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser.",
+        description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser. If the folder "
+        "has a page, as that of a recovery does, it opens that page.",
     )
-    view.add_argument("path", type=Path, help="store, folder with stores (of simulate or recover), or a camera's file")
+    view.add_argument("path", type=input_path, help="store, folder with stores, recovery, or a camera's file")
     view.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences (default: the first twelve)")
     view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
     view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
@@ -109,7 +152,9 @@ def _stores(command: AddCommand) -> None:
         "check every byte of a store, a checkpoint or a data folder",
         "verify data/events.zarr",
     )
-    verify.add_argument("store", help="store (folder or fsspec URL), checkpoint (.safetensors), running.pt or folder")
+    verify.add_argument(
+        "store", type=input_name, help="store or its URL, checkpoint (.safetensors), running.pt, folder"
+    )
     video = command(
         "video",
         "stores.video",
@@ -120,9 +165,11 @@ def _stores(command: AddCommand) -> None:
         "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
         "predictions.",
     )
-    video.add_argument("store", help="event store: folder or fsspec URL")
+    video.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
     video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
-    video.add_argument("--truth", metavar="FRAMES", help="frames.zarr or truth.zarr (default: beside the store)")
+    video.add_argument(
+        "--truth", type=input_name, metavar="FRAMES", help="true frames (default: those beside the store)"
+    )
     video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
     replay = command(
         "replay",
@@ -132,7 +179,7 @@ def _stores(command: AddCommand) -> None:
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into `polarnet "
         "recover - --live` to try live recovery without a camera.",
     )
-    replay.add_argument("store", help="event store: folder or fsspec URL")
+    replay.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
     replay.add_argument("sequence", help="name of the sequence")
     replay.add_argument("--speed", type=positive, default=1.0, help="speed relative to the recording (default: 1)")
 
@@ -156,12 +203,15 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     )
     simulate.set_defaults(overrides=[])
     add = simulate.add_argument
-    add("words", nargs="+", metavar="INPUT", help="input, and after it words KEY=VALUE")
+    add("words", nargs="+", type=input_name, metavar="INPUT", help="input, and after it words KEY=VALUE")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     add("--to", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
     add("--fps", type=positive, metavar="HZ", help="frames a second (default: as a video states)")
     add(
-        "--times", type=Path, metavar="FILE", help="a line with the time of each frame (default: FOLDER/timestamps.txt)"
+        "--times",
+        type=input_path,
+        metavar="FILE",
+        help="times of the frames, a line each (default: FOLDER/timestamps.txt)",
     )
     add("--time-unit", choices=("us", "ms", "s"), default="us", help="unit of these times (default: us)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="cut and reduce the frames to this size")
@@ -185,7 +235,7 @@ def _inspect(command: AddCommand) -> None:
         "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs, and "
         "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
     )
-    inspect.add_argument("file", help="file of a camera, or a store to list")
+    inspect.add_argument("file", type=input_name, help="file of a camera, or a store to list")
     _reading(inspect)
     inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
 
@@ -213,15 +263,15 @@ dv://HOST:PORT of a program that streams its events, or dv://camera
 With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
     )
     add = recover.add_argument
-    add("input", nargs="+", metavar="INPUT", help="recordings, an event store, a folder, or -")
+    add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, a folder, or -")
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
     add("--rotating", type=float, metavar="HZ", help="turns per second of a polarizer before the one camera")
-    add("--triggers", type=Path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
+    add("--triggers", type=input_path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
     add("--start-angle", type=float, metavar="DEG", help="its angle at time 0 or the first trigger (default: 0)")
     add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
     add(
-        "--truth", nargs="?", const=BESIDE, metavar="FRAMES",
+        "--truth", nargs="?", type=input_name, const=BESIDE, metavar="FRAMES",
         help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
     )  # fmt: skip
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
@@ -233,7 +283,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     )
     add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
     add("--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ...")
-    add("--weights", type=Path, metavar="FILE", help="checkpoint of the method's network (default: the shipped one)")
+    add("--weights", type=input_path, metavar="FILE", help="checkpoint of the method (default: the shipped one)")
     add(
         "--thresholds", nargs=2, type=float, metavar=("ON", "OFF"),
         help="contrast thresholds of the camera, natural-log intensity (default: estimated from the events)",
@@ -260,7 +310,7 @@ def _convert(command: AddCommand) -> None:
         "writes a folder with one file for each sequence and channel.",
     )
     add = convert.add_argument
-    add("file", metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
+    add("file", type=input_name, metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
     add("out", type=Path, metavar="OUT", help="file to write; of an event store, the folder")
     add("--to", choices=("evt3", "hdf5", "text"), help="format (default: by the suffix of OUT; of a store: hdf5)")
     add("--start", metavar="TIME", help="start of the span after the first event: 500ms (default: 0s)")
@@ -281,9 +331,9 @@ def _fit_sensor(command: AddCommand) -> None:
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
-    add("--static", type=Path, metavar="FILE", help="recording under constant light")
+    add("--static", type=input_path, metavar="FILE", help="recording under constant light")
     add("--static-light", type=float, metavar="DN", help="its brightness, 0 (covered lens) to 255 (default: 127.5)")
-    add("--flicker", type=Path, nargs="+", metavar="FILE", help="recordings of a lamp or display with sinusoidal light")
+    add("--flicker", type=input_path, nargs="+", metavar="FILE", help="recordings of light that varies as a sine")
     add("--contrast", type=float, metavar="C", help="contrast of the flicker, (max - min) / (max + min)")
     add("--frequency", type=float, nargs="+", metavar="HZ", help="frequency of each flicker recording")
     add("--flicker-light", type=float, default=127.5, metavar="DN", help="mean of the flicker (default: 127.5)")
@@ -302,7 +352,7 @@ def _onnx(command: AddCommand) -> None:
     )
     add = onnx.add_argument
     add("file", type=Path, metavar="OUT.onnx", help="file to write")
-    add("--weights", type=Path, metavar="FILE", help="checkpoint of the network (default: the shipped one)")
+    add("--weights", type=input_path, metavar="FILE", help="checkpoint of the network (default: the shipped one)")
     add("--height", type=int, default=120, help="sensor rows; the file works for this size only (default: 120)")
     add("--width", type=int, default=180, help="sensor columns (default: 180)")
 
@@ -321,11 +371,11 @@ def _benchmark(command: AddCommand) -> None:
         "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True).add_argument
-    asked("--scenes", type=Path, metavar="FOLDER", help="photographs or measured polarization, subfolders included")
-    asked("--recordings", type=Path, metavar="FOLDER", help="HDF5 of E2P, AEDAT-2 and AEDAT4 of a DAVIS with frames")
+    asked("--scenes", type=input_path, metavar="FOLDER", help="photographs or measured polarization, in any depth")
+    asked("--recordings", type=input_path, metavar="FOLDER", help="HDF5 of E2P, AEDAT of a DAVIS with frames")
     asked("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     add = benchmark.add_argument
-    add("--weights", type=Path, metavar="FILE", help="checkpoint (default: the shipped one; of studies the pipeline's)")
+    add("--weights", type=input_path, metavar="FILE", help="checkpoint (default: shipped; of studies the pipeline's)")
     add(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="of --scenes; auto recognises .npz and NAME_0, NAME_45, ... as measured polarization (default: auto)",

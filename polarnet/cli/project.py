@@ -1,6 +1,7 @@
 """The project around the current folder, and the commands that write one or its settings: new, preset."""
 
 import argparse
+import shlex
 import shutil
 from pathlib import Path
 
@@ -8,12 +9,12 @@ from ruamel.yaml import YAML
 
 from polarnet import __version__
 from polarnet.config.experiments import group_of, write_preset
-from polarnet.terminal.installation import shipped_settings
+from polarnet.terminal.installation import LPIPS, LPIPS_COMMAND, missing, shipped_settings, version_of
 
 COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
 CODE = "polarnet/"
-"""Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `REQUIREMENTS`."""
-REQUIREMENTS = "requirements.txt"
+"""Dependencies in dvc.yaml on the code of polarnet, which a project replaces by `VERSION`."""
+VERSION = "version.txt"
 IGNORED = """/data/*
 !/data/*/
 /data/*/*
@@ -73,9 +74,15 @@ def new(options: argparse.Namespace) -> None:
         shutil.copyfile(path, target)
     _write_pipeline(source / "dvc.yaml", folder / "dvc.yaml")
     (folder / ".dvc").mkdir()
-    for name, text in ((REQUIREMENTS, f"polarnet=={__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):
+    for name, text in ((VERSION, f"polarnet {__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):
         (folder / name).write_text(text, encoding="utf-8")
-    print(f"{folder}: run the pipeline with `cd {folder} && dvc repro`; values are in params.yaml")
+    commands = [["cd", str(folder)], ["dvc", "repro"]]
+    if packages := missing("pipeline"):
+        commands.insert(0, ["pip", "install", *packages])
+    if version_of(LPIPS) is None:
+        commands.insert(0, shlex.split(LPIPS_COMMAND))
+    print(f"{folder / 'params.yaml'} has the values; these commands run the pipeline:")
+    print(*map(shlex.join, commands), sep="\n")
 
 
 def _write_pipeline(source: Path, target: Path) -> None:
@@ -86,5 +93,5 @@ def _write_pipeline(source: Path, target: Path) -> None:
     del pipeline["artifacts"]
     for stage in pipeline["stages"].values():
         content = stage.get("do", stage)
-        content["deps"] = [REQUIREMENTS, *(one for one in content["deps"] if not one.startswith(CODE))]
+        content["deps"] = [VERSION, *(one for one in content["deps"] if not one.startswith(CODE))]
     yaml.dump(pipeline, target)

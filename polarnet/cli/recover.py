@@ -26,6 +26,7 @@ from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
+from polarnet.terminal.suggestions import did_you_mean
 
 DEFAULT_METHOD, ROTATING_METHOD = "ours", "rotating_polarizer"
 RECONSTRUCT = "highpass"
@@ -80,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
         for name, repairs in source.repairs.items():
             damage = ((kind, count) for kind, count in repairs.items() if count and kind not in HARMLESS)
             notes += [f"{name}: {count:,} {REPAIRS[kind]}." for kind, count in damage]
-        page = writer.write_page(source.name, facts, notes)
+        page = writer.write_page(source.name, {"command": options.command_line, **facts}, notes)
     for key, value in facts.items():
         print(f"{key:11s} {value}")
     for note in notes:
@@ -125,7 +126,10 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """ValueError for options that do not belong together, or that the input would not use."""
+    """ValueError for an unknown method, and for options that do not belong together or that the input would not use."""
+    if options.method is not None and options.method not in METHODS:
+        near = did_you_mean(options.method, METHODS)
+        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {options.method!r}{near}")
     stated = [name for name in ARRANGEMENTS if getattr(options, name) is not None]
     if len(stated) > 1 and stated != ["rotating", "triggers"]:
         raise ValueError(f"expected one arrangement of polarizers, got {given(options, stated)}")

@@ -32,7 +32,7 @@ PHOTOGRAPH = "astronaut"
 
 
 def demo(options: argparse.Namespace) -> int:
-    """Simulate a built-in photograph and recover it with the shipped weights; returns the exit status."""
+    """Simulate a built-in photograph, recover it with the shipped weights and score it; returns the exit status."""
     from polarnet.cli import main
 
     started = time.monotonic()
@@ -40,9 +40,9 @@ def demo(options: argparse.Namespace) -> int:
     simulated, recovered = (options.out.resolve() / name for name in ("simulated", "recovered"))
     print(f"simulating {photograph.name}; the first run also compiles the simulation")
     status = main(["simulate", str(photograph), *options.overrides, "--out", str(simulated)])
-    status = status or main(["recover", str(simulated / "events.zarr"), "--out", str(recovered)])
+    status = status or main(["recover", str(simulated / "events.zarr"), "--truth", "--out", str(recovered)])
     if status == 0:
-        print(f"video       {recovered / 'recovered.mp4'}\ntruth       {simulated / 'preview.mp4'}")
+        print(f"video       {recovered / 'recovered.mp4'}, with the truth")
         print(f"done in     {time.monotonic() - started:.0f} s; open {recovered / 'index.html'}")
     return status
 

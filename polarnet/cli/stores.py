@@ -54,7 +54,18 @@ def inspect(options: argparse.Namespace) -> None:
 
 
 def view(options: argparse.Namespace) -> None:
-    """Write a page that plays a store, a recording or a recovery, and open it."""
+    """Open the page of a folder that has one, such as a recovery; else write one that plays a store or a recording."""
+    page = options.path / "index.html"
+    if page.is_file():
+        refuse(options, "a folder with a page", ["sequence", "out", "part", *READING])
+    else:
+        page = _written_page(options)
+    print(f"page {page}")
+    if not options.no_browser:
+        webbrowser.open(page.resolve().as_uri())
+
+
+def _written_page(options: argparse.Namespace) -> Path:
     open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
     if is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
@@ -64,10 +75,7 @@ def view(options: argparse.Namespace) -> None:
         films = films_of(options.path, options.sequence or ())
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)
-    write_player(page, f"{options.path}", films, {"command": f"polarnet view {options.path}"})
-    print(f"page {page}")
-    if not options.no_browser:
-        webbrowser.open(page.resolve().as_uri())
+    return write_player(page, f"{options.path}", films, {"command": options.command_line})
 
 
 def video(options: argparse.Namespace) -> None:

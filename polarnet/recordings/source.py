@@ -240,7 +240,7 @@ def sensor_size(path: Path, choices: Choices, height: int | None = None, width: 
     height = choices.height if height is None else height
     width = choices.width if width is None else width
     if height is None or width is None:
-        raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give height and width")
+        raise RecordingError(f"{path.name}: the file does not say how large the sensor is; give --height and --width")
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
         raise RecordingError(f"{path.name}: expected a sensor with sides of 1 to {MAX_SIDE} px, got {height}x{width}")
     if height * width > MAX_PIXELS:

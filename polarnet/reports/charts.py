@@ -10,6 +10,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+from polarnet.methods.intensities import GAIN
 from polarnet.reports.figures import LIGHT, PAGE, styled
 from polarnet.reports.legend import GENERAL, OTHER_COLOUR, Legend, in_order
 from polarnet.reports.tables import COLUMNS
@@ -30,12 +31,14 @@ def _dots(
     intervals: Sequence[Sequence[float]],
     colours: Sequence[str],
     quantity: str,
+    hollow: Sequence[bool] = (),
 ) -> Figure:
-    """A row for each label, the first at the top: a dot at its mean and a line over its interval."""
+    """A row for each label, the first at the top: a dot at its mean, filled or hollow, and a line over its interval."""
     figure, axes = _axes(0.5 + ROW_HEIGHT * len(labels))
-    for place, (mean, interval, colour) in enumerate(zip(means, intervals, colours, strict=True)):
+    rows = zip(means, intervals, colours, hollow or [False] * len(labels), strict=True)
+    for place, (mean, interval, colour, empty) in enumerate(rows):
         axes.plot(interval, [place, place], color=colour)
-        axes.plot(mean, place, "o", color=colour, markersize=5)
+        axes.plot(mean, place, "o", color=colour, markersize=5, fillstyle="none" if empty else "full")
     axes.set_yticks(range(len(labels)), [textwrap.fill(label, LABEL_LETTERS) for label in labels])
     axes.tick_params(axis="y", length=0)
     axes.set(ylim=(len(labels) - 0.5, -0.5), xlabel=quantity)
@@ -49,7 +52,8 @@ def error_chart(metrics: Mapping[str, Mapping[str, Any]], legend: Legend) -> Fig
     methods = in_order(metrics)
     means, intervals = ([metrics[method][key] for method in methods] for key in ("mse", "mse_ci"))
     labels, colours = ([name(method) for method in methods] for name in (legend.label, legend.colour))
-    return _dots(labels, means, intervals, colours, COLUMNS["mse"].heading)
+    solved = [method.endswith(GAIN) for method in methods]
+    return _dots(labels, means, intervals, colours, COLUMNS["mse"].heading, solved)
 
 
 @styled(LIGHT)
@@ -103,7 +107,8 @@ def event_budget_figure(results: Mapping[str, Any]) -> Figure:
         for axis, metric in zip(column, ("psnr", "corr"), strict=True):
             for method in in_order(results[study]):
                 places, values = zip(*((scale * one[x], one[metric]) for one in results[study][method]), strict=True)
-                axis.plot(places, values, "o-", color=GENERAL.colour(method), label=GENERAL.label(method))
+                style = "o--" if method.endswith(GAIN) else "o-"
+                axis.plot(places, values, style, color=GENERAL.colour(method), label=GENERAL.label(method))
             axis.set_xscale("log")
             _plain_numbers(axis.xaxis)
         column[0].set_title(title, loc="left", fontsize=9)

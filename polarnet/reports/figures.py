@@ -17,7 +17,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from matplotlib.rcsetup import cycler
 
 from polarnet.reports.maps import DOLP_COLOURS
 
@@ -67,7 +66,6 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
         "lines.markersize": 3,
         "legend.frameon": False,
         "legend.fontsize": 7,
-        "axes.prop_cycle": cycler(color=["#d6336c", "#3d8fd9", "#e08a1e", "#4aa37c", "#8b6fd6"]),
     }
 
 

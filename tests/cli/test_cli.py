@@ -1,5 +1,9 @@
+import contextlib
+import os
 import re
 import shlex
+import subprocess
+import sys
 
 import fsspec
 import pytest
@@ -59,8 +63,64 @@ def test_verify_of_a_folder_and_of_a_url_names_file_and_sequence_of_a_flipped_or
 
 
 def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
+    (tmp_path / "nothing.zarr").mkdir()
     assert main(["verify", str(tmp_path / "nothing.zarr")]) == 1
     assert "there is no Zarr v3 group" in capsys.readouterr().out
+
+
+MISSING = [
+    "recover nofile", "recover . --truth nofile", "inspect nofile", "view nofile", "video nofile", "replay nofile lake",
+    "verify nofile", "simulate nofile seed=2", "convert nofile out.h5", "fit-sensor --name lab --flicker . nofile",
+    "onnx out.onnx --weights nofile", "benchmark --scenes nofile", "benchmark --recordings nofile",
+]  # fmt: skip
+
+
+def test_an_input_that_does_not_exist_is_refused_before_any_library_is_imported(tmp_path, project_root):
+    program = f"import sys; from polarnet.cli import main; print(*(main(line.split()) for line in {MISSING!r})); "
+    program += "print(sorted({'torch', 'numpy', 'hydra', 'pydantic'} & {*sys.modules}))"
+    environment = os.environ | {"PYTHONPATH": str(project_root)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.splitlines() == [" ".join("1" for _ in MISSING), "[]"]
+    assert done.stderr.splitlines() == [
+        f"polarnet {line.split()[0]}: nofile: there is no such file or folder" for line in MISSING
+    ]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("recovr x", "'benchmark'); did you mean 'recover'? (see polarnet --help)"),
+        ("recover x --mosiac 1", "unrecognized arguments: --mosiac 1; did you mean '--mosaic'? (see polarnet recover"),
+        ("recover x --write pgn", "did you mean 'png'?"),
+        ("recover x --zzz", "unrecognized arguments: --zzz (see polarnet recover --help)"),
+    ],
+)
+def test_a_mistyped_word_is_refused_in_one_line_with_the_closest_one(line, message, capsys):
+    with pytest.raises(SystemExit) as ending:
+        main(line.split())
+    assert ending.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "close"),
+    [
+        ("recover . --method higpass", "highpass"),
+        ("benchmark --scenes . senser=noisy", "sensor"),
+        ("benchmark --scenes . sensor=nosy", "noisy"),
+        ("benchmark --scenes . emulate.contrast_treshold_on=1", "contrast_threshold_on"),
+        ("benchmark --scenes . --methods ourz", "ours"),
+        ("preset smok", "smoke"),
+    ],
+)
+def test_a_mistyped_method_setting_or_preset_is_refused_with_the_closest_one(line, close, project_root, capsys):
+    with contextlib.chdir(project_root):
+        assert main(line.split()) == 1
+    assert f"did you mean {close!r}?" in capsys.readouterr().err
 
 
 def test_a_name_that_is_not_utf_8_is_refused_before_any_work(capsys):

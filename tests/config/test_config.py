@@ -14,7 +14,14 @@ import preloaded
 import pytest
 
 from polarnet.cli import main
-from polarnet.config.experiments import GROUPS, check_overrides, preset_names, preset_values, write_preset
+from polarnet.config.experiments import (
+    GROUPS,
+    changed_values,
+    check_overrides,
+    preset_names,
+    preset_values,
+    write_preset,
+)
 from polarnet.config.tree import Config, load, with_lpips
 
 
@@ -50,7 +57,10 @@ def edit(project: Path, old: str, new: str) -> None:
         ("loss.msee=1.0", r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"),
         ("seed.x=1", r"seed\.x is not a setting; seed is a value, not a section"),
         ("experiment=smok", r"experiment: there is no 'smok'; conf/experiment has demo, paper, paper_small, photog"),
-        ("sensor=noizy", r"sensor: there is no 'noizy'; conf/sensor has celex5, clean, .*, random$"),
+        (
+            "sensor=noizy",
+            r"sensor: there is no 'noizy'; conf/sensor has celex5, clean, .*, random; did you mean 'noisy'\?$",
+        ),
         ("ablation=glob(moz*)", r"ablation: there is no 'moz\*'; conf/ablation has crop, "),
         ("ablation=nothing,panoramma", r"ablation: there is no 'panoramma'; conf/ablation has crop, memories, "),
         ("train.crop=[24,90]", r"loss\.lpips: LPIPS \(alex\) needs images of 31 pixels a side, got \[24, 90\]"),
@@ -223,6 +233,14 @@ def test_a_preset_on_top_of_another_means_the_same_to_hydra_and_to_dvc(project):
     first = load(project, ["experiment=shipped"])
     assert by_hydra.train != first.train
     assert dataclasses.replace(by_hydra, train=first.train) == first
+
+
+@pytest.mark.parametrize("names", [[], ["shipped_whole"], ["smoke", "random"]])
+def test_the_changed_values_of_a_project_are_overrides_that_give_its_configuration(project, project_root, names):
+    for name in names:
+        write_preset(project, name)
+    assert bool(changes := changed_values(project)) == bool(names)
+    assert load(project_root, changes) == load(project)
 
 
 def test_an_unknown_preset_lists_the_ones_there_are(project):

@@ -33,7 +33,7 @@ def test_a_sample_has_the_number_of_events_that_other_readers_found(shared, read
 @pytest.mark.shared
 def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
     path = shared / "data" / "recordings" / "prophesee" / "sample_ncars.dat"
-    with pytest.raises(RecordingError, match=r"sample_ncars\.dat: .*give height and width"):
+    with pytest.raises(RecordingError, match=r"sample_ncars\.dat: .*give --height and --width"):
         read_recording(path)
     recording = read_recording(path, height=240, width=304)
     assert (recording.format, len(recording.events), recording.repairs) == ("dat", 2009, {})
@@ -115,7 +115,7 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
         ({"chunk_events": 0}, "at least one event"),
         ({"clock_mhz": 0.0}, r"a clock of 0\.001 to 10000 MHz"),
-        ({}, "give height and width"),
+        ({}, "give --height and --width"),
     ):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "e.txt", **arguments)

@@ -162,7 +162,7 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
-    (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors is not there"),
+    (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors: there is no such file"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
     (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),

@@ -30,7 +30,10 @@ def browser():
 def files(data, paths, tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     films = films_of(data / "frames.zarr")
+    dim = [film._replace(maps=[one._replace(frames=one.frames // 10) for one in film.maps if one.kind == "dolp"])
+           for film in films[:1]]  # fmt: skip
     return {
+        "dim": write_player(folder / "dim.html", "dim", dim, {}),
         "report": write_report(paths, ["e2v"], RUN, folder),
         "viewer": write_player(folder / "view.html", "frames.zarr", films, {"command": "polarnet view frames.zarr"}),
     }
@@ -55,8 +58,9 @@ def test_the_page_works_alone_cuts_nothing_off_in_light_or_dark_and_axe_finds_no
 def test_the_time_slider_and_play_change_the_picture_and_its_time_and_pause_stops(browser, files):
     with opened(browser, files["viewer"], 800, "light") as (page, _):
         before, time = picture(page, "panes"), page.inner_text("[data-role=ms]")
+        assert page.input_value("[data-role=time]") == page.get_attribute("[data-role=time]", "max") != "0"
         page.locator("[data-role=time]").focus()
-        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowLeft")
         assert picture(page, "panes") != before
         assert page.inner_text("[data-role=ms]") != time
         page.click("[data-role=play]")
@@ -78,6 +82,21 @@ def test_the_error_of_a_constant_tenth_less_is_read_at_the_cursor(browser, files
         ours = next(value for title, value in values.items() if title.startswith("ours"))
         assert float(ours) == pytest.approx(0.1 * float(values["True DoLP"]), abs=0.03)
         assert "True DoLP" in page.inner_text("[data-role=values]")
+
+
+def test_scaled_to_the_scene_the_colours_end_at_its_dolp_and_values_stay(browser, files):
+    """The film has a tenth of the fixture's DoLP, so no pixel is above 0.1."""
+    with opened(browser, files["dim"], 1400, "light") as (page, problems):
+        before, legend = picture(page, "panes"), page.inner_text("[data-role=legend]")
+        assert legend.split() == ["DoLP", "0", "1"]
+        page.check("[data-role=scale]")
+        assert picture(page, "panes") != before
+        end = float(page.inner_text("[data-role=legend]").split()[-1])
+        assert 0.02 < end < 0.12
+        page.locator("[data-role=panes]").focus()
+        page.keyboard.press("ArrowDown")
+        assert 0 < float(page.locator(".panes figcaption span").first.inner_text()) <= end + 0.02
+        assert problems == []
 
 
 def test_zoom_is_shared_by_all_pictures_and_a_button_beside_a_scene_opens_it_in_the_player(browser, files):

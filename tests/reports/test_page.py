@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from polarnet.reports.artefacts import Run
-from polarnet.reports.page import write_report, write_set_page
+from polarnet.reports.legend import GENERAL
+from polarnet.reports.page import verdict, write_report, write_set_page
 from polarnet.reports.player import Film, Map, player_data
 
 RUN = Run(
@@ -36,12 +37,21 @@ def test_the_page_needs_no_other_file_and_no_network(page):
     assert not re.search(r"<script[^>]* src=|<link|@import|url\((?!#)", page.split("<script>")[0])
 
 
-def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_and_the_best_constant(page):
+def test_one_sentence_says_how_good_ours_is_on_which_scenes_beside_the_best_other_method_and_the_oracle(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page)[1]
-    assert lead.startswith("The paper&#39;s network recovers DoLP with a mean squared error of 0.0")
-    lower = r"\d+\xa0% lower than the best"
-    assert re.search(rf"{lower} other method \(E2V: FireNet\) and {lower}", lead)
-    assert lead.count(".") == 2  # the decimal point and the end
+    assert re.fullmatch(
+        r"The paper&#39;s network recovers DoLP with a mean squared error of 0\.0\d+ on 2 simulated scenes, 1 of them "
+        r"generated: \d+\xa0% lower than the best other method of this camera \(E2V: FireNet\) and \d+\xa0% lower than "
+        r"the oracle mean, which needs the truth\.",
+        lead,
+    )
+
+
+def test_the_sentence_compares_with_no_row_of_another_camera():
+    metrics = {name: {"mse": mse} for name, mse in (("rotating_polarizer", 0.01), ("cf", 0.1), ("ours", 0.05))}
+    assert verdict(metrics, "3 scenes", GENERAL).endswith(
+        "3 scenes: 50\xa0% lower than the best other method of this camera (CF)."
+    )
 
 
 def test_the_first_table_has_the_scores_that_were_computed_and_the_best_is_marked(page):

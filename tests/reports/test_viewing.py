@@ -22,6 +22,18 @@ def test_a_recovery_is_a_film_of_its_dolp_and_aolp(tmp_path):
     assert {one.kind for one in film.maps} == {"dolp", "aolp"}
 
 
+def test_the_command_opens_the_page_that_a_recovery_has(tmp_path, monkeypatch, capsys):
+    (tmp_path / "index.html").write_text("a recovery")
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", str(tmp_path)]) == 0
+    assert opened == [(tmp_path / "index.html").as_uri()]
+    assert not (tmp_path / "outputs").exists()
+    assert main(["view", str(tmp_path), "--sequence", "lake"]) == 1
+    assert "a folder with a page: expected no --sequence" in capsys.readouterr().err
+
+
 def test_times_of_a_recording_count_from_its_first_event(tmp_path):
     (tmp_path / "night.txt").write_text("40 30\n913000000 3 2 1\n913000240 4 2 1\n")
     (film,) = films_of(tmp_path / "night.txt")

@@ -19,3 +19,8 @@ def test_the_events_of_the_pixel_add_up_to_the_change_of_its_log_light():
 def test_a_picture_lies_beside_the_page_that_shows_it(project_root, name):
     assert any(f"pictures/{name}.png" in page.read_text() for page in (project_root / "docs").glob("*.md"))
     assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000
+
+
+def test_the_pictures_together_stay_small(project_root):
+    """Every version of them stays in the history."""
+    assert sum(path.stat().st_size for path in (project_root / "docs" / "pictures").iterdir()) < 1_100_000

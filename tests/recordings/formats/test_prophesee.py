@@ -96,7 +96,7 @@ def test_the_sensors_name_generation_or_system_stands_for_its_size(tmp_path, rea
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% " + line.encode() + b"\n% end\n" + words)
     assert read(tmp_path / "e.raw")[0] == ("evt", *size)
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n" + words)
-    with pytest.raises(RecordingError, match="give height and width"):
+    with pytest.raises(RecordingError, match="give --height and --width"):
         read(tmp_path / "e.raw")
 
 
