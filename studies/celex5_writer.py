@@ -25,7 +25,7 @@ from polarnet.recordings.formats.celex5 import (
     microseconds,
 )
 from polarnet.recordings.formats.lines import lines_of
-from polarnet.simulation.compilation import compiled
+from polarnet.runtime.compilation import compiled
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255

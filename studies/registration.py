@@ -39,7 +39,7 @@ from polarnet.events.representations import event_counts
 from polarnet.events.streaming import encode_windows
 from polarnet.networks.polarnet.panorama import displacements
 from polarnet.networks.weights import shipped_weights
-from polarnet.simulation.compilation import compiled
+from polarnet.runtime.compilation import compiled
 from studies.robustness import OURS, conditions_of, simulated, warmup_windows
 from studies.scored_pictures import ingested, scenes_of, settings
 from studies.study import arguments_of, command_line, machine_record, write_section

@@ -1,8 +1,10 @@
 """Speed of the shipped network and of the emulator: python -m studies.speed [--only network|simulation] [--write]
 
-- network: windows a second on random events, for each size of sensor, many at once as in a file and one by one as from
-  a camera, with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write: docs/results/robustness.json,
-  section speed.
+- network: windows a second on random points that move, for each size of sensor, many at once as in a file and one by
+  one as from a camera, with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write:
+  docs/results/robustness.json, section speed.
+- network with --before CHECKOUT: the same of an older checkout of this repository, in turns with this one, and the
+  ratios of the medians. --write: docs/results/speed.json, section turns, and speedup_HEIGHTxWIDTH of files and cameras.
 - simulation: a sensor of 120 x 180 pixels drifts over the coffee photograph at 110 px/s for a second: 300 steps, four
   channels. Times run from rendering to columns in memory and are medians of wall-clock time with compiled kernels.
   Every model and number of threads runs in its own process; the processes take turns, so that other load affects all
@@ -11,10 +13,14 @@
 
 import argparse
 import json
+import os
 import resource
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +33,7 @@ from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
+from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, tune, usable_cores
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.motion import HARMONICS, Sine
@@ -38,7 +45,9 @@ from studies.study import ROOT, arguments_of, command_line, in_own_process, mach
 
 SIZES = ((120, 180), (260, 346), (480, 640))
 RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
+KINDS = ("file", "camera")
 CPU = torch.device("cpu")
+SHIFT = 2  # pixels per window of the points, whose motion the network finds
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 WINDOW_US = round(1e6 / 30)
 HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
@@ -67,14 +76,16 @@ def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, flo
 
 
 def random_channels(height: int, width: int, windows: int) -> list[Events]:
-    """Random events of four channels, as long as this number of windows."""
+    """Events of four channels, as long as this number of windows: random points that move to the right."""
     generator = np.random.default_rng(0)
-    count = windows * round(EVENTS_PER_PIXEL * height * width)
+    count = round(EVENTS_PER_PIXEL * height * width)
+    number = np.repeat(np.arange(windows), count)
 
     def random_channel() -> Events:
-        t = np.sort(generator.integers(0, windows * WINDOW_US, count))
-        y, x = (generator.integers(0, size, count) for size in (height, width))
-        return Events.from_columns(t, x, y, generator.choice([-1, 1], count), height, width)
+        t = WINDOW_US * number + np.sort(generator.integers(0, WINDOW_US, (windows, count))).ravel()
+        y, x = (np.tile(generator.integers(0, size, count), windows) for size in (height, width))
+        p = np.tile(generator.choice([-1, 1], count), windows)
+        return Events.from_columns(t, (x + SHIFT * number) % width, y, p, height, width)
 
     return [random_channel() for _ in range(4)]
 
@@ -95,6 +106,26 @@ def measure_network(threads: int) -> dict[str, Any]:
         for height, width in SIZES
     }
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
+
+
+def measure_turns(before: Path, threads: int) -> dict[str, Any]:
+    """Medians of windows a second of the checkout `before` and of this one, which take turns, and their ratios."""
+    turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
+    for _ in range(ROUNDS):
+        for root, measured in turns.items():
+            command = [sys.executable, __file__, "--sizes", str(threads)]
+            environment = {**os.environ, "PYTHONPATH": str(root)}
+            done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+            measured.append(json.loads(done.stdout.splitlines()[-1])["sizes"])
+
+    def medians(root: Path, size: str) -> dict[str, float]:
+        return {kind: float(np.median([one[size]["pixels"][kind] for one in turns[root]])) for kind in KINDS}
+
+    sizes = {}
+    for size in turns[ROOT][0]:
+        old, new = medians(before, size), medians(ROOT, size)
+        sizes[size] = {"before": old, "now": new, "speedup": {kind: round(new[kind] / old[kind], 2) for kind in KINDS}}
+    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": sizes}
 
 
 def measure_model(model: str, threads: int) -> dict[str, Any]:
@@ -133,11 +164,23 @@ def measure_models() -> dict[str, dict[str, Any]]:
 
 def main() -> None:
     """Measure, print and perhaps write."""
-    parser = command_line(__doc__, "docs/results/robustness.json and emulation.json")
+    parser = command_line(__doc__, "docs/results/robustness.json and emulation.json, or speed.json")
     parser.add_argument("--only", choices=("network", "simulation"))
     parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
+    parser.add_argument("--before", type=Path, help="older checkout, measured in turns with this one")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--sizes", help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
+    if arguments.sizes:
+        print(json.dumps(measure_network(int(arguments.sizes))))
+        return
+    if arguments.before:
+        record, turns = machine_record(), measure_turns(arguments.before, arguments.threads)
+        print(json.dumps(turns, indent=1))
+        if arguments.write:
+            headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in turns["sizes"].items()}
+            write_section("speed", "turns", turns, record, headlines)
+        return
     if arguments.one:
         model, threads = arguments.one
         print(json.dumps(measure_model(model, int(threads))))

@@ -24,8 +24,8 @@ from polarnet.events.rotation import Rotation
 from polarnet.events.stream import Events, concatenate, merge, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Method, Recoverer, Setup
+from polarnet.runtime.compilation import compiled
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION
 from polarnet.stokes import Prediction
 

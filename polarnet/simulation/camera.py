@@ -7,6 +7,7 @@ events a second; rows that wait for too long are lost.
 
 import math
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -17,9 +18,9 @@ from torch import Tensor
 
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, select
+from polarnet.runtime.compilation import compiled, forget_stale_code
 from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.compilation import compiled, forget_stale_code
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.ranges import RandomisedConfig, draws
@@ -230,7 +231,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
     """
     if config.perfect or len(events) == 0:
         return events, 0
-    forget_stale_code()
+    forget_stale_code(Path(__file__).parent)
     t, y = events.t.numpy(), events.y.numpy()
     times_us = t + config.row_latency_us * y
     if config.jitter_us:

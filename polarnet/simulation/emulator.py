@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -13,8 +14,8 @@ from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range, check_shape
+from polarnet.runtime.compilation import forget_stale_code
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.compilation import forget_stale_code
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
 from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
@@ -186,7 +187,7 @@ def emulate_lights(
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
     """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
-    forget_stale_code()
+    forget_stale_code(Path(__file__).parent)
     numbers, height, width, config, key = channels
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key % 2**64)

@@ -11,8 +11,8 @@ from jaxtyping import Float32, Float64
 from pydantic import Field
 from torch import Tensor
 
+from polarnet.runtime.compilation import compiled, inlined
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import compiled, inlined
 from polarnet.simulation.scene import PolarizationScene
 
 HARMONICS = 3  # number of sines in the motion along each axis

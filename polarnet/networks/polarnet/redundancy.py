@@ -21,6 +21,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from polarnet.networks.polarnet import kernels
+
 MOMENTS = 6  # AA, AB, BB, AC, BC and the weighted number of steps
 MIN_EVIDENCE = 1e-2  # squared events, added to AA and BB: without events the solution is 0, not infinite
 MAX_CORRELATION = 0.95  # limit on the correlation of A and B, which bias correction can push beyond 1
@@ -37,7 +39,7 @@ def faded(
     for now in x:
         state = torch.addcmul(now, state, keep)
         sums.append(state)
-    return torch.stack(sums)
+    return torch.stack(sums) if len(sums) > 1 else sums[0].unsqueeze(0)
 
 
 class SecondMoments(nn.Module):
@@ -53,12 +55,14 @@ class SecondMoments(nn.Module):
         self.log_mismatch = nn.Parameter(torch.full((memories,), -3.5))
         self.log_step = nn.Parameter(torch.full((memories,), -2.0))
 
+    def factors(self) -> Float[Tensor, "3 m"]:
+        """Return the trained numbers: decrease with activity, variance of the mismatch, and variance of a step."""
+        return torch.stack([self.log_activity, self.log_mismatch, self.log_step]).exp()
+
     def forward(self, events: Float[Tensor, "n m 4 h w"], pooled: int) -> Float[Tensor, "n m 6 h/{pooled} w/{pooled}"]:
         """Return the `MOMENTS` of the event sums of four channels, averaged over `pooled` x `pooled` pixels."""
         # linear operations follow the pooling, when the images are small: memory traffic dominates the cost
-        activity, mismatch, step = (
-            p.exp().view(-1, 1, 1, 1) for p in (self.log_activity, self.log_mismatch, self.log_step)
-        )
+        activity, mismatch, step = self.factors().view(3, -1, 1, 1, 1)
         steps = events.abs()
         weight = 1 / (1 + activity * events.square().sum(2, keepdim=True))
         weighted = weight * steps
@@ -152,6 +156,10 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
     Depthwise convolutions of channels_last images, one axis after the other, need fewer additions than pooling.
     """
     channels, rows, columns = x.shape[-3:]
+    if kernels.compiled_path(x):
+        means = torch.empty(x.shape)
+        kernels.box_means(x.reshape(-1, rows, columns).numpy(), width, means.view(-1, rows, columns).numpy())
+        return means
     ones = x.new_ones(channels, 1, 1, width)
     with torch.autocast(x.device.type, enabled=False):
         sums = x.float().contiguous(memory_format=torch.channels_last)

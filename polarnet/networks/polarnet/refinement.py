@@ -107,13 +107,16 @@ def wide_differences(
 
 
 def moved_by_events(
-    stokes: Float[Tensor, "n 2 h w"], sums: Sequence[Float[Tensor, "t b m 2 h w"]], gains: Float[Tensor, "n g h w"]
+    stokes: Float[Tensor, "n 2 h w"],
+    sums: Sequence[Float[Tensor, "t b m 2 h w"]],
+    scale: Float[Tensor, "n 1 1 1"],
+    gains: Float[Tensor, "n g h w"],
 ) -> Float[Tensor, "n 2 h w"]:
-    """Update (s1, s2) by adding gains times event sums to atanh(s1) and atanh(s2)."""
+    """Update (s1, s2) by adding gains times event sums times their scale to atanh(s1) and atanh(s2)."""
     moves = stokes.new_zeros(())
     for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
         moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
-    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves.sum(1))
+    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + scale * moves.sum(1))
 
 
 def averaged(

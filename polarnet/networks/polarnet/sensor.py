@@ -12,12 +12,14 @@ perceptron, weighs these clues; the loss of DoLP trains it.
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.base.blocks import enlarged
+from polarnet.networks.polarnet import kernels
 from polarnet.networks.polarnet.redundancy import block_means, box_means
 
 BLOCK = 4  # side in pixels of the blocks whose means form a neighbourhood
@@ -67,6 +69,8 @@ class Equaliser(nn.Module):
         `state` is empty at the start. Otherwise it holds the numbers of ON and OFF events so far, and the change of
         their weights from 1.
         """
+        if polarity.shape[1] == 1 and kernels.compiled_path(polarity):
+            return self._compiled(polarity, count, state)
         events = F.relu(torch.cat([count + polarity, count - polarity], dim=2)) / 2
         totals, change = state or [torch.zeros_like(events[0])] * 2
         noise, pull, surplus = self.log_noise.exp(), self.log_pull.exp(), self.log_surplus.exp()
@@ -91,6 +95,37 @@ class Equaliser(nn.Module):
             mismatches.append(mismatch.detach().mean((1, 2, 3)))
         on, off = torch.stack(weighted).split(4, dim=2)
         return Equalised(on - off, on + off, torch.stack(sums), torch.stack(mismatches)), [totals, change]
+
+    def _compiled(
+        self, polarity: Float[Tensor, "t 1 4 h w"], count: Float[Tensor, "t 1 4 h w"], state: list[Tensor]
+    ) -> tuple[Equalised, list[Tensor]]:
+        """Same as `forward`, with the kernels."""
+        noise, pull, surplus = (p.exp().numpy() for p in (self.log_noise, self.log_pull, self.log_surplus))
+        totals, change = state or [polarity.new_zeros(1, 8, *polarity.shape[-2:]) for _ in range(2)]
+        height, width = (size // BLOCK for size in polarity.shape[-2:])
+        limits = np.array(WEIGHTS, np.float32)
+        polarities, events = torch.empty_like(polarity), torch.empty_like(count)
+        strips = np.empty((height, 8, 2), np.float32)
+        sums, mismatches = [], []
+        for k in range(len(polarity)):
+            window = (polarity[k, 0].numpy(), count[k, 0].numpy())
+            blocks, after = polarity.new_empty(1, 8, height, width), torch.empty_like(totals)
+            kernels.add_events(*window, totals[0].numpy(), change[0].numpy(), after[0].numpy(), blocks[0].numpy())
+            near = box_means(blocks, BLOCKS)[0].numpy()
+            totals, change = after, torch.empty_like(totals)
+            kernels.deviations(totals[0].numpy(), near, noise[()], np.float32(OUTLIER), strips)
+            power, excess = (strips.sum(0, dtype=np.float64) / (4 * height * width)).T
+            mismatch = (excess / power.clip(MIN_POWER)).clip(*MISMATCH)
+            mean_counts = near.mean((1, 2), dtype=np.float64)  # interpolation keeps the mean
+            on, off = mean_counts[:4].mean() + surplus, mean_counts[4:].mean() + surplus
+            balance = np.sqrt([off / on, on / off]).repeat(4).astype(np.float32)
+            prior = (pull * noise / mismatch).astype(np.float32)
+            images = (image.numpy() for image in (change[0], polarities[k, 0], events[k, 0]))
+            kernels.weigh(*window, totals[0].numpy(), near, prior, balance, limits, *images)
+            sums.append(mean_counts.mean())
+            mismatches.append(mismatch.mean())
+        summary = polarity.new_tensor([sums, mismatches])[..., None]
+        return Equalised(polarities, events, *summary), [totals, change]
 
 
 def _near(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.base import blocks
+from polarnet.networks.polarnet import kernels, redundancy, refinement
 from polarnet.networks.polarnet import panorama as panoramas
-from polarnet.networks.polarnet import redundancy, refinement
 from polarnet.networks.polarnet.expected_error import ExpectedError, error_features
 from polarnet.networks.polarnet.panorama import Memory, Motion, Panorama
 from polarnet.networks.polarnet.redundancy import block_means, length
@@ -105,6 +105,8 @@ class Solved(NamedTuple):
     candidates: Candidates
     sums: list[Float[Tensor, "t b m 2 h w"]]
     """Sums of e0 - e90 and e45 - e135 for each memory, at single pixels and averaged over each width of `WIDE`."""
+    scale: Float[Tensor, "n 1 1 1"]
+    """Factor of the sums: `Scale`."""
     images: Float[Tensor, "n 4 h/2 w/2"]
     """The panorama's four images."""
     certain: Float[Tensor, "n 1 1 1"]
@@ -228,26 +230,25 @@ class StokesUNet(nn.Module):
         panorama, certain, next_panorama = self._panorama(polarity, sensor, before_panorama)
         clues = scale_features(panorama, equalised.total.flatten(), equalised.mismatch.flatten())
         scale = torch.ones_like(certain) if "scale" in self.without else self.scale(clues)
-        images, of_window = scale * self.step * panorama, scale.view(t, b, 1, 1, 1, 1)
-        steps = redundancy.faded(polarity.unsqueeze(2), keep, before_sums)  # t, b, memory, polarizer
-        wide_steps = refinement.wide_differences(polarity, before_wide, keep)
-        sums, wide = of_window * steps, [of_window * means for means in wide_steps]
-        from_sums, moments = self._candidates(sums.flatten(0, 1), b, before_moments)
+        images = scale * self.step * panorama
+        steps, moments, of_events = self._event_sums(polarity, count, scale, before_sums)
+        wide = refinement.wide_differences(polarity, before_wide, keep)
+        from_sums, moments = self._candidates(moments, b, before_moments)
         from_slopes = self._slope_candidates(images)
         candidates = Candidates(*(torch.cat(pair, dim=1) for pair in zip(from_sums, from_slopes, strict=True)))
 
-        x2 = blocks.on_blocks(self.stem, _event_images(sums.flatten(0, 1), scale * count.flatten(0, 1)))
+        x2 = blocks.on_blocks(self.stem, of_events)
         centred = torch.cat([images - images.mean((-1, -2), keepdim=True), certain.expand_as(images[:, :1])], dim=1)
         x2 = F.relu(x2 + self.from_mosaic(centred.contiguous(memory_format=torch.channels_last)))
-        solved = Solved(x2, candidates, [refinement.differences(sums), *wide], images, certain, noise, (height, width))
-        last_wide = [means[-1] for means in wide_steps]
-        return solved, [*isolated, *sensitivity, steps[-1], moments, *last_wide, *next_panorama]
+        sums = [refinement.differences(steps), *wide]
+        solved = Solved(x2, candidates, sums, scale, images, certain, noise, (height, width))
+        return solved, [*isolated, *sensitivity, steps[-1], moments, *(means[-1] for means in wide), *next_panorama]
 
     def refine_windows(
         self, solved: Solved, state: list[Tensor]
     ) -> tuple[Prediction, Float[Tensor, "n k h2 w2"], list[Tensor]]:
         """Second half of `unroll`. `state` holds the states of the recurrent layers, empty at the start."""
-        x2, candidates, sums, images, certain, noise, (height, width) = solved
+        x2, candidates, sums, scale, images, certain, noise, (height, width) = solved
         t, b = sums[0].shape[:2]
         y4, recurrent = self._quarter(x2, candidates, b, state)
         y2 = self.at_half(self.up_half(y4, skip=x2))
@@ -257,7 +258,7 @@ class StokesUNet(nn.Module):
         coarse = blocks.enlarged(torch.cat([s1, s2, dolp + weights[:, -1:] * self.constant], dim=1), 4)
         gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
         level = refinement.moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
-        moved = refinement.moved_by_events(level, sums, gains)
+        moved = refinement.moved_by_events(level, sums, scale, gains)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * blocks.enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(refinement.averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
@@ -280,13 +281,58 @@ class StokesUNet(nn.Module):
         self.expected.weight.copy_(weight)
         self.expected.bias.fill_(bias)
 
+    def _event_sums(
+        self,
+        polarity: Float[Tensor, "t b 4 h w"],
+        count: Float[Tensor, "t b 4 h w"],
+        scale: Float[Tensor, "n 1 1 1"],
+        before: Float[Tensor, "b m 4 h w"] | None,
+    ) -> tuple[Float[Tensor, "t b m 4 h w"], Float[Tensor, "n m 6 h4 w4"], Float[Tensor, "n c h w"]]:
+        """Return the faded sums of polarities, their `SecondMoments`, and `_event_images`, both of the scaled sums."""
+        keep = self.memories.view(-1, 1, 1, 1)
+        if kernels.compiled_path(polarity) and not self.without:
+            return self._compiled_event_sums(polarity, count, scale, before)
+        steps = redundancy.faded(polarity.unsqueeze(2), keep, before)
+        sums = scale.unsqueeze(1) * steps.flatten(0, 1)
+        with torch.autocast(polarity.device.type, enabled=False):  # the solution takes differences of similar numbers
+            windows = self._unless("redundancy", sums).split(polarity.shape[1])  # a window fits into a core's cache
+            moments = torch.cat([self.moments(window, pooled=4) for window in windows])
+        return steps, moments, _event_images(sums, scale * count.flatten(0, 1))
+
+    def _compiled_event_sums(
+        self, polarity: Tensor, count: Tensor, scale: Tensor, before: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Same as `_event_sums`, with the kernel."""
+        t, b, _, height, width = polarity.shape
+        memories = len(self.memories)
+        steps = polarity.new_empty(t, b, memories, 4, height, width)
+        moments = polarity.new_empty(t * b, memories, redundancy.MOMENTS, height // 4, width // 4)
+        half = torch.is_autocast_enabled("cpu")
+        images = torch.empty(t * b, 4 * memories + 1, height, width, dtype=torch.uint16 if half else torch.float32)
+        noise = self.moments.factors().numpy()
+        before = torch.zeros_like(steps[0]) if before is None else before
+        for n in range(t * b):
+            k, stream = divmod(n, b)
+            kernels.sums_and_moments(
+                (before if k == 0 else steps[k - 1])[stream].numpy(),
+                polarity[k, stream].numpy(),
+                count[k, stream].numpy(),
+                scale[n].numpy().item(),
+                self.memories.numpy(),
+                noise,
+                half,
+                steps[k, stream].numpy(),
+                moments[n].numpy(),
+                images[n].numpy(),
+            )
+        return steps, moments, images.view(torch.bfloat16) if half else images
+
     def _candidates(
-        self, events: Float[Tensor, "n m 4 h w"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None
+        self, moments: Float[Tensor, "n m 6 h4 w4"], streams: int, state: Float[Tensor, "b d c h4 w4"] | None
     ) -> tuple[Candidates, Float[Tensor, "b d c h4 w4"]]:
         """Return the candidates from changes in time, and the sums of moments for the next window."""
-        with torch.autocast(events.device.type, enabled=False):  # the solution takes differences of similar numbers
-            windows = self._unless("redundancy", events).split(streams)  # a single window fits into a core's cache
-            moments = torch.stack([self.moments(window, pooled=4).flatten(1, 2) for window in windows]).unsqueeze(2)
+        with torch.autocast(moments.device.type, enabled=False):  # the solution takes differences of similar numbers
+            moments = moments.flatten(1, 2).unflatten(0, (-1, streams)).unsqueeze(2)
             sums = redundancy.faded(moments, self.decays.view(-1, 1, 1, 1), state)
             shape = (len(self.decays), len(self.memories), -1)
             near = redundancy.neighbourhoods(sums.flatten(0, 1).flatten(1, 2), self.scales)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, compiled, inlined
+from polarnet.runtime.compilation import borrowing, compiled, inlined
 
 STRIP = 4000  # pixels, approximately
 SPARE = 8  # entries that `flagged` may write beyond the pixels of a strip

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import compiled, inlined
+from polarnet.runtime.compilation import compiled, inlined
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 

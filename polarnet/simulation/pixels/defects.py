@@ -9,8 +9,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from polarnet.runtime.compilation import compiled
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.physics import MAX_RATE_HZ
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform

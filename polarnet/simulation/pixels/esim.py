@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import PositiveFloat
 
+from polarnet.runtime.compilation import ZERO, compiled
 from polarnet.runtime.sections import section
-from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.physics import PixelConfig

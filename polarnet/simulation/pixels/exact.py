@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import ZERO, borrowing, compiled, inlined
+from polarnet.runtime.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import active as strips
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import empty_active, flagged, gather, keep_continuing, scatter

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, compiled, inlined
+from polarnet.runtime.compilation import borrowing, compiled, inlined
 
 FULL_SCALE = 255.0  # DN
 KNEE = 20.0  # DN below which v2e's response is linear

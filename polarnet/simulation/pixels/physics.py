@@ -9,8 +9,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field, NonNegativeFloat
 
+from polarnet.runtime.compilation import borrowing, inlined
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.compilation import borrowing, inlined
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.light import FULL_SCALE, MIN_DARK_DN
 from polarnet.simulation.pixels.randomness import mixed, normal, uniform

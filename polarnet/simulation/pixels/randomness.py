@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from polarnet.simulation.compilation import borrowing, compiled, inlined
+from polarnet.runtime.compilation import borrowing, compiled, inlined
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: the increment of SplitMix64 (Steele et al., OOPSLA 2014)
 MIX_1, MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)  # its output function, variant 13

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.simulation.compilation import ZERO, borrowing, compiled
+from polarnet.runtime.compilation import ZERO, borrowing, compiled
 from polarnet.simulation.pixels import physics, randomness
 from polarnet.simulation.pixels.active import SPARE, flag_words, flagged, flags_of, rows_of_strip
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order

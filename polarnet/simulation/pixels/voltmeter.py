@@ -8,8 +8,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from polarnet.runtime.compilation import ZERO, compiled
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows

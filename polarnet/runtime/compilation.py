@@ -1,4 +1,4 @@
-"""Compilation of this folder's kernels with numba: cached on disk, without the interpreter's lock."""
+"""Compilation of kernels with numba: cached on disk, without the interpreter's lock."""
 
 import contextlib
 import functools
@@ -34,12 +34,11 @@ def inlined(kernel: Callable) -> Any:
 
 
 @functools.cache
-def forget_stale_code() -> None:
-    """Delete cached machine code that is older than a source file of this folder, once per process.
+def forget_stale_code(folder: Path) -> None:
+    """Delete cached machine code below `folder` that is older than a source file there, once per process.
 
     Call this before the first kernel: numba compares the cache with the kernel's own file, not with its callees'.
     """
-    folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.rglob("*.py"))
     for index in folder.rglob("__pycache__/*.nbi"):
         with contextlib.suppress(OSError):  # another process deleted it first, or the installation is read-only
