@@ -33,7 +33,7 @@ from polarnet.recordings.source import SAFE, Block, Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.terminal.installation import installation
 
-READ_BYTES = 2**20
+READ_BYTES = 2**18
 PIPE_BYTES = 2**16  # capacity of a pipe, which bounds what one read returns
 MAX_READ_AHEAD = 2**26  # bytes that wait to be parsed; if there are more, the program at the other end has to wait
 POLL_S = 0.001

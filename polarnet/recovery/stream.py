@@ -36,7 +36,7 @@ from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
-FILE_PIECES, LIVE_PIECES = 2, 64  # most pieces that are read ahead; those of a file hold a million events
+FILE_PIECES, LIVE_PIECES = 2, 512  # most pieces read ahead: a file has pieces of a million events, a pipe small ones
 MAX_LATENCY_S = 0.15  # from the arrival of a window's last event to its frame, where that can be reached
 MAX_BACKLOG_US = 1_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
 MAX_LOAD = 0.8  # share of the time that work on a camera's windows may take; above it no delay is ever made up for
@@ -156,7 +156,7 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
                 arrived.append(piece.read_at)
                 yield window
 
-    with Ahead(source.pieces, LIVE_PIECES if source.live else FILE_PIECES) as ahead:
+    with Ahead(source.pieces, FILE_PIECES if source.waits else LIVE_PIECES) as ahead:
         live = _live_runs(ahead.take, windows, arrived, most, source.waits)
         for run in live if source.live else runs_of(windows(ahead), most):
             start = time.perf_counter()
@@ -194,8 +194,8 @@ def _live_runs(
             if not (pieces or waiting):
                 return
             waiting += windows(pieces)
-        if len(waiting) > 1 and not waits and len(work_s) > 2:
-            usual_s, between_us = statistics.median(work_s), waiting[1].stop_us - waiting[0].stop_us
+        if len(waiting) > 1 and not waits and len(work_s) > 1:
+            usual_s, between_us = statistics.median_low(work_s), waiting[1].stop_us - waiting[0].stop_us
             late = time.perf_counter() - arrived[0] + len(waiting) * usual_s > MAX_LATENCY_S
             if late and usual_s > MAX_LOAD * between_us * 1e-6:
                 waiting = [join_windows(waiting)]
