@@ -1,4 +1,4 @@
-"""Speed of the shipped network and of the emulator: python -m studies.speed [--only network|simulation] [--write]
+"""Speed of the network, the emulator and recovery: python -m studies.speed [--only network|simulation|live] [--write]
 
 - network: windows a second on random points that move, for each size of sensor, many at once as in a file and one by
   one as from a camera, with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write:
@@ -9,16 +9,21 @@
   channels. Times run from rendering to columns in memory and are medians of wall-clock time with compiled kernels.
   Every model and number of threads runs in its own process; the processes take turns, so that other load affects all
   of them alike. --write: docs/results/emulation.json.
+- live: `polarnet recover` of a million random events a second on 260 x 346 pixels, with every output and with numbers
+  alone. From a store: how many times as fast as real time. `--live`, `--seconds` (60) of lines through a pipe: latency,
+  joined windows, and memory in the second and the last third of the time. --write: docs/results/speed.json.
 """
 
 import argparse
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +33,12 @@ import torch
 from skimage import data
 
 from polarnet.config.tree import load
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, concatenate
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
+from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, tune, usable_cores
 from polarnet.simulation.camera import Camera
@@ -40,6 +46,7 @@ from polarnet.simulation.motion import HARMONICS, Sine
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.scene import scene_from_rgb
+from polarnet.storage.events import EventStore
 from studies.simulated_rig import Drift
 from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
 
@@ -53,11 +60,12 @@ WINDOW_US = round(1e6 / 30)
 HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
+LIVE_SIZE, EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = (260, 346), 1_000_000, 100, 10, 10
 ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
 
 
 def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
-    """Windows a second of the network on random events in memory, as precise as `recover`.
+    """Windows a second of the network on random points that move, in memory, as precise as `recover`.
 
     `file` takes as many at once as `recover` of a file, `camera` one after the other.
     """
@@ -162,10 +170,66 @@ def measure_models() -> dict[str, dict[str, Any]]:
     }
 
 
+def measure_live(seconds: int) -> dict[str, Any]:
+    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs."""
+    generator, size = np.random.default_rng(0), dict(zip(("height", "width"), LIVE_SIZE, strict=True))
+    y, x, p, k = (generator.integers(0, limit, EVENTS_PER_S) for limit in (*LIVE_SIZE, 2, 4))
+    t = np.arange(EVENTS_PER_S) * 1_000_000 // EVENTS_PER_S
+    tails = np.array([b" %3d %3d %d %3d\n" % row for row in zip(x, y, p, 45 * k, strict=True)])
+    figures: dict[str, Any] = {**size, "events_per_s": EVENTS_PER_S, "seconds": seconds}
+    with tempfile.TemporaryDirectory() as folder:
+        store = EventStore.create(f"{folder}/events.zarr", ["random"], *LIVE_SIZE, {})
+        second = [Events.from_columns(t[k == n], x[k == n], y[k == n], 2 * p[k == n] - 1, **size) for n in range(4)]
+        file = [concatenate([shifted(one, -1_000_000 * n) for n in range(FILE_SECONDS)]) for one in second]
+        store.write("random", file, 1_000_000 * FILE_SECONDS)
+        store.finish()
+        for name, written in (("all", ["zarr", "png", "mp4"]), ("numbers", ["zarr"])):
+            outputs = ["--write", *written, "--out", f"{folder}/{name}"]
+            command = [sys.executable, "-m", "polarnet.cli", "recover", *outputs]
+            of_file = subprocess.run([*command, f"{folder}/events.zarr"], capture_output=True, text=True, check=True)
+            with tempfile.TemporaryFile("w+") as printed:
+                live = subprocess.Popen([*command, "--live", "-"], stdin=subprocess.PIPE, stdout=printed)
+                resident_mib = feed(live, tails, seconds)
+                printed.seek(0)
+                facts = printed.read()
+            third = len(resident_mib) // 3
+            figures[name] = {
+                "realtime_factor": float(re.findall(r"([\d.]+) times as fast", of_file.stdout)[0]),
+                "latency_ms": float(re.findall(r"([\d.]+) ms \(median\), 95", facts)[0]),
+                "latency_ms_95": float(re.findall(r"95 % within ([\d.]+) ms", facts)[0]),
+                "frames": re.findall(r"(?m)^(?:frames|joined) +(.+)$", facts),
+                "resident_mib": {"second third": max(resident_mib[third:-third]), "last": max(resident_mib[-third:])},
+            }
+    return figures
+
+
+def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
+    """Write lines, a time and a tail each, in real time; returns the process's resident MiB at each second."""
+    assert live.stdin is not None
+    resident_mib, number = [], len(tails) // CHUNKS_PER_S
+    digits = 10 ** np.arange(LIVE_DIGITS)[::-1]
+    live.stdin.write(b"%d %d\n" % LIVE_SIZE[::-1])
+    start = time.perf_counter()
+    for chunk in range(seconds * CHUNKS_PER_S):
+        rows = tails[chunk % CHUNKS_PER_S * number :][:number].view(np.uint8).reshape(number, -1)
+        times = chunk * 1_000_000 // CHUNKS_PER_S + np.arange(number) * 1_000_000 // len(tails)
+        heads = (times[:, None] // digits % 10 + ord("0")).astype(np.uint8)
+        time.sleep(max(0.0, start + (chunk + 1) / CHUNKS_PER_S - time.perf_counter()))
+        live.stdin.write(np.hstack([heads, rows]).tobytes())
+        if chunk % CHUNKS_PER_S == 0:
+            pages = Path(f"/proc/{live.pid}/statm").read_text().split()[1]
+            resident_mib.append(int(pages) * resource.getpagesize() >> 20)
+    live.stdin.close()
+    if live.wait():
+        raise RuntimeError(f"recover ended with exit status {live.returncode}")
+    return resident_mib
+
+
 def main() -> None:
     """Measure, print and perhaps write."""
-    parser = command_line(__doc__, "docs/results/robustness.json and emulation.json, or speed.json")
-    parser.add_argument("--only", choices=("network", "simulation"))
+    parser = command_line(__doc__, "docs/results/robustness.json, emulation.json and speed.json")
+    parser.add_argument("--only", choices=("network", "simulation", "live"))
+    parser.add_argument("--seconds", type=int, default=60, help="of live input")
     parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
     parser.add_argument("--before", type=Path, help="older checkout, measured in turns with this one")
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
@@ -185,14 +249,22 @@ def main() -> None:
         model, threads = arguments.one
         print(json.dumps(measure_model(model, int(threads))))
         return
-    for kind, (name, section) in {"network": ("robustness", "speed"), "simulation": ("emulation", "models")}.items():
+    studies: dict[str, tuple[str, str, Callable[[], dict[str, Any]]]] = {
+        "network": ("robustness", "speed", lambda: measure_network(arguments.threads)),
+        "simulation": ("emulation", "models", measure_models),
+        "live": ("speed", "live", lambda: measure_live(arguments.seconds)),
+    }
+    for kind, (name, section, measure) in studies.items():
         if arguments.only in (None, kind):
             record = machine_record()
-            network = kind == "network"
-            figures = measure_network(arguments.threads) if network else measure_models()
+            figures = measure()
             print(json.dumps(figures, indent=1), flush=True)
+            headlines = {}
+            if kind == "live":
+                factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
+                headlines = {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
             if arguments.write:
-                write_section(name, section, figures, record)
+                write_section(name, section, figures, record, headlines)
 
 
 if __name__ == "__main__":

@@ -114,6 +114,13 @@ def brief_costs() -> Iterator[None]:
 
 
 @pytest.fixture
+def progress_log(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
+    """Lines on standard error, which is a file, with a line of progress as often as possible."""
+    monkeypatch.setattr("polarnet.terminal.progress.LINE_S", 0.0)
+    return lambda: capfd.readouterr().err.splitlines()
+
+
+@pytest.fixture
 def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the worker processes of `pmap` fork from one that has imported polarnet, which saves their imports."""
     from types import SimpleNamespace

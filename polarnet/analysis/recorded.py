@@ -21,6 +21,7 @@ from polarnet.recordings.truth import Truth, read_truth, truth_formats
 from polarnet.stokes import Mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
+from polarnet.terminal.progress import ProgressBar
 
 MAX_WINDOW_RATIO = 1.25  # between the frames' interval and the networks' window, beyond which a warning says so
 MIN_AGREEMENT = 0.1  # correlation of events and frames (`Lag.agreement`); below it their lag is not known
@@ -52,7 +53,8 @@ def make_recorded_set(
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of recordings, got {'a file' if root.exists() else 'none'}")
     recordings, notes = [], []
-    for path in sorted(path for path in root.rglob("*") if path.is_file()):
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    for path in ProgressBar(files, "recordings", unit="file"):
         try:
             if detect_format(path) not in truth_formats():
                 raise RecordingError(f"expected a format with frames, {', '.join(truth_formats())}")

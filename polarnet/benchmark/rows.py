@@ -15,6 +15,7 @@ from polarnet.methods.method import Method, Recoverer, Setup, each_map, joined, 
 from polarnet.metrics.references import REFERENCES, Reference
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
+from polarnet.terminal.progress import steps
 
 MAX_OPEN = 32
 """Maximum number of methods whose weights stay in memory between sequences."""
@@ -36,7 +37,7 @@ class Context:
 def predictions_of(names: Sequence[str], sequence: TestSequence, context: Context) -> dict[str, Prediction]:
     """Prediction by row, one frame per window, on the CPU; ValueError for a value that is no number."""
     predictions = {}
-    for name in names:
+    for name in steps(names):
         if name in REFERENCES:
             prediction = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
         else:

@@ -18,6 +18,7 @@ from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import dequantise, quantise
 from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, signed_bytes
+from polarnet.terminal.progress import ProgressBar
 
 MAX_FILM_FRAMES = 12
 """Frames of the report's player for each scene; they keep a page of 50 scenes below 30 MB."""
@@ -63,7 +64,7 @@ def run_benchmark(
     )
     results: list[Benchmark] = list(mapper(score, names))
     first = test_set.sequence(names[0])
-    costs = {row: cost_of(row, first, context) for row in config.methods}
+    costs = {row: cost_of(row, first, context) for row in ProgressBar(config.methods, "cost", unit="method")}
     sums = {
         row: functools.reduce(operator.add, (result.reliability[row] for result in results))
         for row in results[0].reliability

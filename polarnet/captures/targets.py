@@ -35,6 +35,7 @@ from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
+from polarnet.terminal.progress import ProgressBar
 
 STATUS_FILE = "status.json"
 WHITE = 255.0  # maximum of reduced pictures
@@ -103,7 +104,7 @@ def calibrate_targets(root: Path, out: Path, config: RecordingsConfig, about: Ma
     contents = Contents(dict.fromkeys(names, "test"), about)
     frames = FrameStore.create(out / "frames.zarr", contents, height, width)
     targets = []
-    for name in names:
+    for name in ProgressBar(names, "calibrate", unit="target"):
         target = read_target(root / name, config)
         one, clean = calibrate_target(target, config)
         channels, t_us, intensity = aligned(target._replace(events=clean), one, config)

@@ -26,6 +26,7 @@ from polarnet.characterization.thresholds import (
 )
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
+from polarnet.terminal.progress import ProgressBar
 
 MAX_LEAK_ERROR = 0.05  # relative; above it shot noise hides the leak, and its error is unreliable
 MIN_PIXELS = 50
@@ -67,7 +68,7 @@ def fit_sensor(
     if len(sizes) != 1:
         raise ValueError(f"expected recordings of one sensor, got sizes {sorted(sizes)} (height, width)")
     fit = SensorFit()
-    ordered = [by_pixel(one) for one in recordings]
+    ordered = [by_pixel(one) for one in ProgressBar(recordings, "sort", unit="recording")]
     noise = None
     if static is not None:
         noise = estimate_noise(ordered[0], hot_under_constant_light(static), pixel)
@@ -86,7 +87,8 @@ def fit_sensor(
     reason = "under constant light, shot noise comes before the leak; record brighter"
     fit.enter("leak_rate_hz", leak, "needs a static recording" if noise is None else reason)
     shortest_us, flickering = dead_time.value if dead_time else 0.0, ordered[len(ordered) - len(flickers) :]
-    sources = [source_of(one, events, pixel, shortest_us) for one, events in zip(flickers, flickering, strict=True)]
+    recorded = ProgressBar(zip(flickers, flickering, strict=True), "fit", len(flickers), unit="recording")
+    sources = [source_of(one, events, pixel, shortest_us) for one, events in recorded]
     deviations = _fit_flicker(fit, sources, leak.value if leak else 0.0) if sources else (0.0, 0.0)
     if not sources:
         fit.missing |= dict.fromkeys(FLICKER_PARAMETERS, "needs a flicker recording")

@@ -15,6 +15,7 @@ from polarnet.events.stream import Events, concatenate, crop, slice_time
 from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
 from polarnet.runtime.machine import seed_for
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
+from polarnet.terminal.progress import ProgressBar
 
 MAX_SIDE = 240  # pixels of the part that is compared
 MAX_DURATION_US = 20_000_000
@@ -90,7 +91,7 @@ def emulated(
     """Events of one channel under light, in pieces of bounded memory; `frames` may be a view by `frames_of`."""
     state: SensorState | None = None
     parts, step = [], max(2, CHUNK_PIXELS // frames[0].size)
-    for k in range(0, len(frames), step):
+    for k in ProgressBar(range(0, len(frames), step), "twin", unit="piece"):
         some = np.ascontiguousarray(frames[k : k + step])[:, None]
         (events,), state = emulate(some, t_us[k : k + step], sensor, key, state)
         parts.append(events)

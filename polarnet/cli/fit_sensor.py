@@ -12,6 +12,7 @@ from polarnet.cli.project import settings_root, working_folder
 from polarnet.events.stream import Events
 from polarnet.recordings.recording import read_recording
 from polarnet.simulation.presets import SENSORS
+from polarnet.terminal.progress import ProgressBar
 
 WRITTEN_BY = "# Written by `polarnet fit-sensor`"
 MIDDLE_DN = 127.5
@@ -36,19 +37,22 @@ def run(options: argparse.Namespace) -> None:
     check_options(options)
     preset = _preset_path(options.name)
 
-    def read(path: Path) -> Events:
-        return read_recording(path, part=options.part, **reading_of(options)).events
-
-    static = read(options.static) if options.static else None
+    paths = [*([options.static] if options.static else []), *(options.flicker or [])]
+    recordings = [
+        read_recording(path, part=options.part, **reading_of(options)).events
+        for path in ProgressBar(paths, "read", unit="recording")
+    ]
+    static = recordings.pop(0) if options.static else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
     flickers: list[FlickerRecording] = []
     lights: list[tuple[str, Events, Flicker | float]] = []
     if static is not None:
         lights.append((f"static: {options.static.name}", static, static_light))
-    for path, frequency_hz in zip(options.flicker or [], options.frequency or [], strict=True):
+    flickering = zip(options.flicker or [], recordings, options.frequency or [], strict=True)
+    for path, events, frequency_hz in flickering:
         flicker = Flicker(options.flicker_light, options.contrast, frequency_hz)
-        flickers.append(FlickerRecording(f"flicker {frequency_hz:g} Hz", read(path), flicker))
-        lights.append((f"flicker: {path.name}", flickers[-1].events, flicker))
+        flickers.append(FlickerRecording(f"flicker {frequency_hz:g} Hz", events, flicker))
+        lights.append((f"flicker: {path.name}", events, flicker))
     fit = fit_sensor(static, static_light, flickers, SENSORS["default"])
     notes = list(fit.notes)
     if options.static and options.static_light is None:

@@ -10,6 +10,7 @@ from polarnet.benchmark.results import read_record, read_rows, write_benchmark
 from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
 from polarnet.config.tree import DOLP_TRAINING, Config
 from polarnet.metrics.lpips import NO_RECORD, stored_record
+from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.recorder import HISTORY
 
 
@@ -33,7 +34,7 @@ def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
     benchmark = Path(config.paths.benchmark)
     shutil.rmtree(benchmark / "sets", ignore_errors=True)  # an earlier run may have had other sets
     tables = {}
-    for name in set_names(config):
+    for name in ProgressBar(set_names(config), "tables", unit="set"):
         here = {row: folders[row] for row in rows_of_set(name, list(folders))}
         settings, of_set = dataclasses.replace(config.benchmark, methods=list(here)), {"set": name, **about}
         tables[name] = write_benchmark(set_folder(config, name), read_rows(here, name), settings, config.seed, of_set)

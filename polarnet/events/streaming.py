@@ -12,7 +12,7 @@ from jaxtyping import Float, Int64, Integer
 from torch import Tensor
 
 from polarnet.events.representations import Encode
-from polarnet.events.stream import Events, concatenate, slice_count
+from polarnet.events.stream import Events, concatenate, slice_count, slice_time
 from polarnet.runtime.arrays import Array, whole_numbers
 
 SHORTEST_STEP_US = 100
@@ -35,11 +35,22 @@ class EventWindow(NamedTuple):
     channels: Sequence[Events]
     start_us: int
     stop_us: int
+    joined: int = 1
+    """Number of windows that `join_windows` put together, because a processor did not keep up with a camera."""
 
     @property
     def length_us(self) -> int:
         """Length of the window, at least 1."""
         return max(1, self.stop_us - self.start_us)
+
+
+def join_windows(windows: Sequence[EventWindow]) -> EventWindow:
+    """One window with the events of windows that end one after the other, each event once even if they overlap."""
+    parts = [windows[0].channels]
+    for before, after in itertools.pairwise(windows):
+        parts.append([slice_time(events, before.stop_us, after.stop_us) for events in after.channels])
+    channels = [concatenate(of_one) for of_one in zip(*parts, strict=True)]
+    return EventWindow(channels, windows[0].start_us, windows[-1].stop_us, sum(window.joined for window in windows))
 
 
 @dataclass(frozen=True)

@@ -110,9 +110,13 @@ def image_of(state: FilterState, config: FilterConfig, intensity: Callable[[Imag
 
     `config.intensity_range` becomes [0, 1], intensities outside are clipped.
     """
-    logs = state.log_intensity * np.exp(-config.rate_per_us * (state.t_us - state.updated_us))
+    logs = -config.rate_per_us * (state.t_us - state.updated_us)
+    np.multiply(state.log_intensity, np.exp(logs, out=logs), out=logs)
     low, high = config.intensity_range
-    return torch.from_numpy(((intensity(logs) - low) / (high - low)).clip(0, 1))
+    image = intensity(logs)
+    image -= low
+    image /= high - low
+    return torch.from_numpy(image.clip(0, 1, out=image))
 
 
 def open_filter(setup: Setup, intensity: Callable[[Image], Image]) -> Recoverer:

@@ -7,9 +7,11 @@ windows. If the step does not divide the length, events in the gap before a wind
 
 The sums, recurrent layers and gains of a network fit the window length of its training (`of_any_length`). Shorter
 windows are joined with earlier ones up to about that length, and longer windows are cut into parts of that length.
+Windows that were joined because a processor did not keep up (`EventWindow.joined`) stay whole, which takes one step.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -76,8 +78,11 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
     def start(height: int, width: int) -> Recent:
         return Recent(begin(recoverer, height, width), ())
 
+    def fits(window: EventWindow) -> bool:
+        return trained_us / SAME <= window.length_us <= (math.inf if window.joined > 1 else trained_us * SAME)
+
     def predict(state: Recent, windows: Sequence[EventWindow]) -> tuple[Recent, Prediction]:
-        if all(trained_us / SAME <= window.length_us <= trained_us * SAME for window in windows):
+        if all(map(fits, windows)):
             history, prediction = advance(recoverer, state.history, windows)
             return Recent(history, ()), prediction
         frames = []

@@ -33,8 +33,9 @@ from polarnet.recordings.source import SAFE, Block, Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.terminal.installation import installation
 
-READ_BYTES = 2**20
-MAX_READ_AHEAD = 64  # blocks of READ_BYTES, for a file; a camera does not wait, so its queue is unbounded
+READ_BYTES = 2**18
+PIPE_BYTES = 2**16  # capacity of a pipe, which bounds what one read returns
+MAX_READ_AHEAD = 2**26  # bytes that wait to be parsed; if there are more, the program at the other end has to wait
 POLL_S = 0.001
 MAX_WAIT_S = 0.02  # events whose times later ones must confirm wait no longer, unless later ones have arrived
 SCHEME, CAMERA = "dv://", "camera"
@@ -96,8 +97,10 @@ class LiveLines:
     def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
         self.name = name
         self._source, self._idle_s, self._columns = source, idle_s, 4 if mosaic else 5
-        self._grows = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-        self._queue: Queue[tuple[bytes, float] | None] = Queue(MAX_READ_AHEAD if self._grows else 0)
+        self.waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
+        self._queue: Queue[tuple[bytes, float] | None] = Queue(
+            MAX_READ_AHEAD // (READ_BYTES if self.waits else PIPE_BYTES)
+        )
         own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
         Thread(target=self._read, args=[own], daemon=True).start()
         self._stream: _Stream | None = None
@@ -170,7 +173,7 @@ class LiveLines:
                 if data:
                     self._queue.put((data, time.perf_counter()))
                     quiet_since = time.monotonic()
-                elif not self._grows or time.monotonic() - quiet_since > self._idle_s:
+                elif not self.waits or time.monotonic() - quiet_since > self._idle_s:
                     return
                 else:
                     time.sleep(POLL_S)
@@ -189,6 +192,8 @@ class LiveCamera:
     Events with wrong times are left out and counted in `counts`. RuntimeError where dv-processing is missing;
     RecordingError where the camera or program cannot be reached.
     """
+
+    waits = False
 
     def __init__(self, address: str, mosaic: Mosaic, idle_s: float):
         self.name = address

@@ -93,7 +93,8 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -
     else:
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     pieces = clean.clean(reader, live=True)
-    return Input(reader.name, reader.height, reader.width, pieces, {reader.name: reader.counts}, live=True)
+    repairs = {reader.name: reader.counts}
+    return Input(reader.name, reader.height, reader.width, pieces, repairs, live=True, waits=reader.waits)
 
 
 def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: float) -> Rotation:

@@ -5,6 +5,7 @@ import operator
 import statistics
 import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,13 +14,21 @@ from typing import NamedTuple
 from torch import Tensor
 
 from polarnet.events.rotation import Rotation
-from polarnet.events.streaming import SHORTEST_STEP_US, TRAINED_WINDOW_US, EventWindow, WindowCutter, WindowRule
+from polarnet.events.streaming import (
+    SHORTEST_STEP_US,
+    TRAINED_WINDOW_US,
+    EventWindow,
+    WindowCutter,
+    WindowRule,
+    join_windows,
+)
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Piece
+from polarnet.recovery.ahead import Ahead
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.stokes import Prediction
@@ -27,7 +36,13 @@ from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+FILE_PIECES, LIVE_PIECES = 2, 512  # most pieces read ahead: a file has pieces of a million events, a pipe small ones
+MAX_LATENCY_S = 0.15  # from the arrival of a window's last event to its frame, where that can be reached
+MAX_BACKLOG_US = 1_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
+MAX_LOAD = 0.8  # share of the time that work on a camera's windows may take; above it no delay is ever made up for
+MEASURED = 9  # latest measurements of that work whose median counts, so that one delay does not
 MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
+KEEP_UP = "Larger blocks of pixels (--binning), fewer events or a filter (--method highpass) take less time."
 SCORES = {
     "mse": "MSE {:.4f}",
     "psnr": "PSNR {:.2f} dB",
@@ -50,6 +65,8 @@ class Input(NamedTuple):
     """4, or 1 for a camera behind a rotating polarizer or none."""
     live: bool = False
     """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
+    waits: bool = True
+    """Whether the source waits until it is read. Windows of a live one that does not are joined if need be."""
 
     def shares_read(self) -> dict[str, str]:
         """The part of the files that is read, in words; empty where their formats do not tell."""
@@ -116,8 +133,9 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
     """Yield a frame for each window, of live input as soon as the window's last event has arrived.
 
-    Windows that are already available, such as those of a file, are processed in runs of up to `at_once` windows
-    (default: `Recoverer.at_once`). ValueError if the input is shorter than one window.
+    Another thread reads the input ahead. Windows that are already available, such as those of a file, are processed in
+    runs of up to `at_once` windows (default: `Recoverer.at_once`). If a live source does not wait and the processor is
+    too slow for it, the windows that have arrived are joined to one. ValueError if no window is complete.
     """
     if min(source.height, source.width) < 2:  # the shipped network's DoLP of one row is not finite
         raise ValueError(
@@ -127,16 +145,20 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
     cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
     most = at_once or recoverer.at_once(source.height, source.width)
-    latest: Piece | None = None
-    number = 0
+    arrived: deque[float] = deque()  # when the last events of the windows that have no frame yet came
+    until_us = number = 0
 
     def windows(pieces: Iterable[Piece]) -> Iterator[EventWindow]:
-        nonlocal latest
-        for latest in pieces:
-            yield from cutter.add(latest.channels, latest.until_us)
+        nonlocal until_us
+        for piece in pieces:
+            until_us = piece.until_us
+            for window in cutter.add(piece.channels, until_us):
+                arrived.append(piece.read_at)
+                yield window
 
-    for pieces in ([piece] for piece in source.pieces) if source.live else [source.pieces]:
-        for run in runs_of(windows(pieces), most):
+    with Ahead(source.pieces, FILE_PIECES if source.waits else LIVE_PIECES) as ahead:
+        live = _live_runs(ahead.take, windows, arrived, most, source.waits)
+        for run in live if source.live else runs_of(windows(ahead), most):
             start = time.perf_counter()
             history, prediction = advance(recoverer, history, run)
             maps = each_map(prediction, Tensor.cpu)
@@ -145,9 +167,43 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
                 frame = each_map(maps, operator.itemgetter(k))
                 _check_finite(frame, window)
                 number += 1
-                yield Frame(window, frame, (done - start) / len(run), done - latest.read_at if latest else 0.0)
+                came = [arrived.popleft() for _ in range(window.joined)][-1]
+                yield Frame(window, frame, (done - start) / len(run), done - came)
     if not number:
-        raise ValueError(_too_short(source, rule, latest.until_us if latest else 0))
+        raise ValueError(_too_short(source, rule, until_us))
+
+
+def _live_runs(
+    take: Callable[..., list[Piece]],
+    windows: Callable[[Iterable[Piece]], Iterator[EventWindow]],
+    arrived: Sequence[float],
+    most: int,
+    waits: bool,
+) -> Iterator[list[EventWindow]]:
+    """Yield runs of the windows that are there, joined to one if the source does not wait and they would be late.
+
+    `take` returns the pieces that are there (`Ahead.take`) and `windows` cuts them. `arrived` holds the time when the
+    last event of each window without a frame came.
+    """
+    waiting: list[EventWindow] = []
+    work_s: deque[float] = deque(maxlen=MEASURED)  # of a window: its step, and its writing if that is waited for
+    while True:
+        backlog_us = waiting[-1].stop_us - waiting[0].stop_us if waiting else 0
+        if not waiting or (not waits and backlog_us < MAX_BACKLOG_US):
+            pieces = take(wait=not waiting)
+            if not (pieces or waiting):
+                return
+            waiting += windows(pieces)
+        if len(waiting) > 1 and not waits and len(work_s) > 1:
+            usual_s, between_us = statistics.median_low(work_s), waiting[1].stop_us - waiting[0].stop_us
+            late = time.perf_counter() - arrived[0] + len(waiting) * usual_s > MAX_LATENCY_S
+            if late and usual_s > MAX_LOAD * between_us * 1e-6:
+                waiting = [join_windows(waiting)]
+        if run := next(runs_of(waiting, most), None):
+            waiting = waiting[len(run) :]
+            start = time.perf_counter()
+            yield run
+            work_s.append((time.perf_counter() - start) / len(run))
 
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:
@@ -177,15 +233,19 @@ def recover(
 ) -> dict[str, str]:
     """Write all frames of the method that `words` describe; returns facts for the page and the terminal."""
     step_ms, latency_ms = array("d"), array("d")  # 16 bytes a frame, because a camera may run for days
-    last_us, started = 0, time.perf_counter()
+    last_us, joined, started = 0, (0, 0), time.perf_counter()
     with writer, ProgressBar(desc="recover", unit_scale=1e-6, bar_format=BAR) as bar:
         for frame in frames:
             writer.add(frame.window, frame.prediction, source.live)
+            if frame.window.joined > 1:
+                joined = joined[0] + frame.window.joined, joined[1] + 1
             step_ms.append(1000 * frame.step_s)
             latency_ms.append(1000 * frame.latency_s)
             bar.update(frame.window.stop_us - last_us)
             last_us = frame.window.stop_us
             more = {"latency": f"{latency_ms[-1]:.1f} ms"} if source.live else source.shares_read()
+            if any(joined):
+                more["joined"] = f"{joined[0]} windows"
             bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **more)
     run_s, stream_s = time.perf_counter() - started, last_us * 1e-6
     length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
@@ -201,7 +261,10 @@ def recover(
     if not source.live:
         return facts | {"time": f"{run_s:.2f} s, {stream_s / run_s:.2f} times as fast as real time"}
     most_ms = sorted(latency_ms)[int(0.95 * (len(latency_ms) - 1))]
-    return facts | {"latency": f"{statistics.median(latency_ms):.1f} ms (median), 95 % within {most_ms:.1f} ms"}
+    facts["latency"] = f"{statistics.median(latency_ms):.1f} ms (median), 95 % within {most_ms:.1f} ms"
+    if any(joined):
+        facts["joined"] = f"{joined[0]:,} windows to {joined[1]:,} frames: the processor did not keep up. {KEEP_UP}"
+    return facts
 
 
 def _too_short(source: Input, rule: WindowRule, duration_us: int) -> str:

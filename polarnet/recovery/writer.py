@@ -32,7 +32,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
-from polarnet.reports.preview import Sheet, VideoWriter, foot_of, with_even_sides
+from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK
@@ -46,6 +46,7 @@ MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
 SHEET_PICTURES = 3  # pictures in recovered.png
 GAP = 4  # pixels between the maps of a picture
+DOLP, INTENSITY, ANGLE, EVENTS = "DoLP", "intensity", "AoLP (hue), DoLP (saturation)", "events"  # captions
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",
     "dolp": "degree of linear polarization, divided by 65535",
@@ -155,38 +156,31 @@ class RecoveryWriter:
         if not (sampled or {"mp4", "png"} & set(self.outputs)):
             return
         events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
-        pixels = event_image(events, self._scale.after(events))
+        maps = _coloured(prediction, event_image(events, self._scale.after(events)))
         if "mp4" in self.outputs:
-            self._video.add(self._labelled(window, prediction, pixels))
+            self._video.add(self._labelled(window, prediction, maps))
         if not sampled and "png" not in self.outputs:
             return
-        picture = _side_by_side(prediction, pixels)
+        picture = _side_by_side(maps)
         if sampled:
             self._sample.offer(Picture(window.stop_us, picture, _byte_maps(events, prediction)))
         if "png" in self.outputs:
             _write_png(self.folder / "png" / f"{number:06d}.png", picture)
 
-    def _labelled(
-        self, window: EventWindow, prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]
-    ) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def _labelled(self, window: EventWindow, prediction: Prediction, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        above, below = {"events": events}, {}
-        plain = plain_intensity(prediction)
-        if plain is None:
-            above["DoLP"] = dolp_image(prediction.dolp)
-        else:
-            above["intensity"] = intensity_image(plain)
+        above, below = {name: maps[name] for name in (EVENTS, DOLP, INTENSITY) if name in maps}, {}
         true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
             s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
             if s0 is not None:
                 below[f"polarization, {kind} S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
-            below["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
+            below[ANGLE] = maps[ANGLE]
         if true:
             above["true DoLP"] = dolp_image(true.dolp)
-            below["true AoLP (hue), DoLP (saturation)"] = angle_image(true.dolp, true.aolp)
+            below[f"true {ANGLE}"] = angle_image(true.dolp, true.aolp)
         foot = foot_of((window.start_us, window.stop_us), sum(map(len, window.channels)))
         return self._sheet.picture([above, below], foot)
 
@@ -211,14 +205,18 @@ class RecoveryWriter:
         self._arrays.add(frame)
 
 
-def _side_by_side(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Captioned:
+    """The maps of a frame as pictures, by caption."""
     plain = plain_intensity(prediction)
-    maps = [dolp_image(prediction.dolp) if plain is None else intensity_image(plain)]
+    maps = {DOLP: dolp_image(prediction.dolp)} if plain is None else {INTENSITY: intensity_image(plain)}
     if prediction.aolp is not None:
-        maps.append(angle_image(prediction.dolp, prediction.aolp))
-    maps.append(events)
-    gap = np.full((maps[0].shape[0], GAP, 3), 255, np.uint8)
-    return with_even_sides(np.concatenate([part for one in maps for part in (one, gap)][:-1], axis=1))
+        maps[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
+    return maps | {EVENTS: events}
+
+
+def _side_by_side(maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
+    gap = np.full((maps[EVENTS].shape[0], GAP, 3), 255, np.uint8)
+    return with_even_sides(np.concatenate([part for one in maps.values() for part in (one, gap)][:-1], axis=1))
 
 
 def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
@@ -253,6 +251,7 @@ def _film(source: str, pictures: Sequence[Picture]) -> Film:
 
 
 def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a PNG without compression: thousands are written while a camera runs."""
-    _, data = cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 0])
-    path.write_bytes(data.tobytes())
+    """Write a PNG without compression or filters, which cost more: thousands are written while a camera runs."""
+    how = [cv2.IMWRITE_PNG_COMPRESSION, 0, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+    _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), how)
+    path.write_bytes(data.data)

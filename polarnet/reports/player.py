@@ -23,6 +23,7 @@ from polarnet.reports.legend import Legend, with_structure
 from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
 from polarnet.runtime.files import replaced
 from polarnet.storage.panels import NO_EVENTS, Panel
+from polarnet.terminal.progress import ProgressBar
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
 
@@ -100,7 +101,7 @@ def player_data(films: Sequence[Film]) -> dict[str, Any]:
     frames = min(MAX_FRAMES, max(1, 2 * MAX_STRIP_BYTES // max(1, size_of_two)))
     return {
         "colours": {name: table.tobytes().hex() for name, table in COLOURS.items()},
-        "scenes": [_scene(film, frames) for film in films],
+        "scenes": [_scene(film, frames) for film in ProgressBar(films, "page", unit="scene")],
     }
 
 

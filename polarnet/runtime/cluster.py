@@ -4,16 +4,20 @@ import functools
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
 from polarnet.terminal.installation import installation
 from polarnet.terminal.progress import ProgressBar as Bar
+from polarnet.terminal.progress import within
 
 ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
+POLL_S = 0.2  # between two looks at the progress of worker processes
+BAR = "{l_bar}{bar}| {n:.4g}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,19 +33,20 @@ def pmap(
 ) -> list[Result]:
     """`[function(item) for item in items]`, in that order, with a progress bar called `label`.
 
-    `address` names a Dask scheduler (extra `cluster`); without it, `workers` processes share the items, and one worker
-    means this process. Items of a worker that dies are handed out again. RuntimeError names the unfinished items after
-    `ATTEMPTS` deaths without a result, or a scheduler that has ended; exceptions of `function` end the map unchanged.
+    The bar also moves inside an item, by `polarnet.terminal.progress.steps`, unless a Dask worker runs it. `address`
+    names a Dask scheduler (extra `cluster`); without it, `workers` processes share the items, and one worker means this
+    process. Items of a worker that dies are handed out again. RuntimeError names the unfinished items after `ATTEMPTS`
+    deaths without a result, or a scheduler that has ended; exceptions of `function` end the map unchanged.
     """
-    with Bar(total=len(items), desc=label, unit="", disable=None if len(items) > 1 else True) as bar:
+    with Bar(total=len(items), desc=label, unit="", bar_format=BAR) as bar:
         if address is not None:
             return _over_dask(function, items, address, bar)
         if workers > 1 and len(items) > 1:
             return _over_processes(function, items, min(workers, len(items)), bar, label)
         results = []
         for item in items:
-            results.append(function(item))
-            bar.update()
+            with within(bar.update):
+                results.append(function(item))
         return results
 
 
@@ -66,12 +71,24 @@ def _over_processes(
     return [results[i] for i in range(len(items))]
 
 
-def _start_worker(threads: int) -> None:
+def _start_worker(threads: int, done: Any) -> None:
+    """Set up a worker process; `done` is the number of items that all workers have finished, with fractions."""
+    global _done
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with_parent()
     limit_threads(threads)
     tune()
+    _done = done
+
+
+def _in_worker(function: Callable[[Item], Result], item: Item) -> Result:
+    def move(share: float) -> None:
+        with _done.get_lock():
+            _done.value += share
+
+    with within(move):
+        return function(item)
 
 
 def _collect(
@@ -85,7 +102,8 @@ def _collect(
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
     try:
-        executor = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads,))
+        done = spawn.Value("d", len(results))
+        executor = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads, done))
     except OSError as error:
         raise RuntimeError(
             f"several processes need semaphores in /dev/shm, which cannot be made there: {error}; run again with "
@@ -94,10 +112,16 @@ def _collect(
     with executor as pool:
         try:
             with _interrupts_held():  # by the workers too, until they are set up: their imports would show tracebacks
-                futures = {pool.submit(function, items[i]): i for i in range(len(items)) if i not in results}
-            for future in as_completed(futures):
-                results[futures[future]] = future.result()
-                bar.update()
+                undone = [i for i in range(len(items)) if i not in results]
+                futures = {pool.submit(_in_worker, function, items[i]): i for i in undone}
+            finished: SimpleQueue[Future] = SimpleQueue()
+            for future in futures:
+                future.add_done_callback(finished.put)
+            while len(results) < len(items):
+                with suppress(Empty):
+                    future = finished.get(timeout=POLL_S)
+                    results[futures[future]] = future.result()
+                bar.update(done.value - bar.n)
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 for worker in multiprocessing.active_children():

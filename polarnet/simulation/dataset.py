@@ -14,6 +14,7 @@ from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
+from polarnet.terminal.progress import steps
 
 Mapper = Callable[..., Iterable[Any]]
 
@@ -60,7 +61,7 @@ def _fill_part(
     camera: Camera,
     seed: int,
 ) -> None:
-    for sequence in events.parts[part]:
+    for sequence in steps(events.parts[part]):
         channels, analyzer = emulated(sequence)
         events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence), analyzer)
 

@@ -32,6 +32,7 @@ from polarnet.simulation.scene import (
 from polarnet.simulation.variation import VariationConfig, varied
 from polarnet.storage.frames import Contents, FrameStore, Polarization
 from polarnet.storage.scenes import SceneStore, as_stored
+from polarnet.terminal.progress import steps
 
 logger = logging.getLogger(__name__)
 
@@ -169,7 +170,7 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
     """Write the part of both stores that holds the sequences of these motions."""
     config, polarizers, valid = synthesis.motion, synthesis.polarizers, None
     t_us, pixels = frame_times_us(config), grid(polarizers.layout, config.sensor_height, config.sensor_width)
-    for (name, picture), over_scene in itertools.groupby(motions, lambda motion: (motion.scene, motion.picture)):
+    for (name, picture), over_scene in itertools.groupby(steps(motions), lambda motion: (motion.scene, motion.picture)):
         planes, dynamic_range = _planes_of(name, picture, synthesis)
         if not scenes.masked:
             planes = planes._replace(valid=None)

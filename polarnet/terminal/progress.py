@@ -1,13 +1,61 @@
-"""Progress of work that takes longer than two seconds: a bar on a terminal, elsewhere a line every 30 s."""
+"""Progress of work that takes longer than two seconds: a bar on a terminal, elsewhere a line every 30 s.
+
+A bar of tasks (`polarnet.runtime.cluster.pmap`) also moves inside a task: the task runs `within` its part of the bar,
+and loops over `steps`.
+"""
 
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+Item = TypeVar("Item")
+Move = Callable[[float], object]
+"""Moves a bar on by a number of tasks."""
+
 PATIENCE_S = 2.0  # shorter work shows nothing
 LINE_S = 30.0  # between two lines where the output is no terminal, such as a log file
+
+
+_move: ContextVar[Move] = ContextVar("move", default=lambda share: None)
+
+
+@contextmanager
+def within(move: Move) -> Iterator[None]:
+    """Move a bar on by 1 in total: by a share after each of the `steps` inside, and by the rest at the end."""
+    left = 1.0
+
+    def move_by(share: float) -> None:
+        nonlocal left
+        left -= share
+        move(share)
+
+    token = _move.set(move_by)
+    try:
+        yield
+    finally:
+        _move.reset(token)
+    move(max(0.0, left))
+
+
+def steps(items: Collection[Item]) -> Iterator[Item]:
+    """Yield items; after each, the bar of the running task moves on by an equal share of the task.
+
+    >>> from polarnet.terminal.progress import steps, within
+    >>> shares = []
+    >>> with within(shares.append):
+    ...     print(*steps("abcd"))
+    a b c d
+    >>> shares
+    [0.25, 0.25, 0.25, 0.25, 0.0]
+    """
+    move = _move.get()
+    for item in items:
+        with within(lambda share: move(share / len(items))):
+            yield item
 
 
 class ProgressBar(tqdm):
@@ -22,7 +70,7 @@ class ProgressBar(tqdm):
         """Arguments of tqdm."""
         self.disable = False
         self.terminal = sys.stderr.isatty()
-        in_log = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S}
+        in_log = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S, "miniters": 0}
         pace = {"delay": PATIENCE_S} if self.terminal else in_log
         super().__init__(*arguments, **{**pace, **options})
 

@@ -3,6 +3,7 @@ import dataclasses
 import functools
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -143,3 +144,12 @@ def test_two_processes_give_the_rows_of_one(five_scenes, context, tmp_path):
     one = run_benchmark(five_scenes, context, chosen, None)
     two = run_benchmark(five_scenes, context, chosen, None, mapper)
     assert one.rows == two.rows
+
+
+def test_a_log_shows_the_progress_of_a_benchmark_method_by_method(five_scenes, context, progress_log):
+    mapper = functools.partial(pmap, workers=1, label="test")
+    run_benchmark(five_scenes, context, config(methods=["zeros", "cf"]), None, mapper)
+    lines = progress_log()
+    shares = re.findall(r"test: .+\| ([\d.]+)/4 ", "\n".join(lines))
+    assert list(dict.fromkeys(shares)) == ["0", "0.5", "1", "1.5", "2", "2.5", "3", "3.5", "4"]
+    assert sum(line.startswith("cost: ") for line in lines) == 3

@@ -63,6 +63,11 @@ def test_the_yaml_written_loads_as_a_sensor(folder, capsys, monkeypatch):
     assert load(project, ["sensor=mine"]).emulate.contrast_threshold_on == pytest.approx(0.1733, abs=5e-4)
 
 
+def test_a_log_shows_the_progress_of_each_part_of_the_work(folder, progress_log):
+    assert main([*FIT, "--name", "mine", *FLICKER]) == 0
+    assert {line.split(":")[0] for line in progress_log() if "100%" in line} == {"read", "sort", "fit", "twin"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "remedy"),
     [

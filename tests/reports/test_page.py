@@ -156,3 +156,8 @@ def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(path
         assert text in set_page
     assert "LPIPS (" not in set_page
     assert "`" not in set_page.split("<main>")[1].split("<script")[0]
+
+
+def test_a_log_shows_the_progress_of_a_page(paths, tmp_path, progress_log):
+    write_report(paths, ["e2v"], RUN, tmp_path / "report")
+    assert any(line.startswith("page: 100%") for line in progress_log())

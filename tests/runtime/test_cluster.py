@@ -1,5 +1,7 @@
 import errno
+import itertools
 import os
+import re
 import signal
 import sys
 import threading
@@ -11,6 +13,7 @@ import pytest
 from preloaded import FORKSERVER
 
 from polarnet.runtime.cluster import pmap
+from polarnet.terminal.progress import ProgressBar, steps
 
 
 def square(value: int) -> int:
@@ -48,6 +51,35 @@ def fail_on_two(value: int) -> int:
 def test_results_come_in_the_order_of_the_items(workers):
     assert pmap(square, list(range(7)), workers=workers, label="squares") == [0, 1, 4, 9, 16, 25, 36]
     assert pmap(square, [], workers=workers, label="squares") == []
+
+
+def count_slowly(number: int) -> int:
+    """Counts to the number, in steps that the parent process has time to see."""
+    return sum(1 for _ in steps(range(number)) if time.sleep(0.05) is None)
+
+
+@pytest.mark.usefixtures("forked_workers")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_log_shows_progress_inside_an_item_too(progress_log, monkeypatch, workers):
+    monkeypatch.setattr("polarnet.runtime.cluster.POLL_S", 0.01)
+    assert pmap(count_slowly, [4, 8], workers=workers, label="count") == [4, 8]
+    shares = [float(share) for share in re.findall(r"count: .+\| ([\d.]+)/2 ", "\n".join(progress_log()))]
+    assert shares == sorted(shares)
+    assert shares[-1] == 2
+    assert sum(share % 1 > 0 for share in shares) >= 8
+
+
+def test_a_log_has_a_line_with_the_time_left_every_half_minute(capfd, monkeypatch):
+    clock = itertools.count(0, 5)
+    monkeypatch.setattr("tqdm.std.time", lambda: float(next(clock)))
+    for _ in ProgressBar(range(60), "work", unit=""):
+        pass
+    lines = capfd.readouterr().err.splitlines()
+    spent = [line.split("[")[1].split("<") for line in lines]
+    seconds = [60 * int(elapsed[:2]) + int(elapsed[3:]) for elapsed, _ in spent]
+    assert all(30 <= after - before <= 45 for before, after in itertools.pairwise([0, *seconds]))
+    assert all(re.match(r"\d\d:\d\d, ", left) for _, left in spent)
+    assert len(lines) >= 5
 
 
 @pytest.mark.usefixtures("forked_workers")

@@ -1,6 +1,7 @@
 """The stage in between: pictures in, scenes, trajectories and exact frames out."""
 
 import dataclasses
+import functools
 import logging
 import math
 import shutil
@@ -17,7 +18,9 @@ from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
+from polarnet.runtime.cluster import pmap
 from polarnet.simulation.camera import IDEAL, Grid, grid, weights_of
+from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import channel_light
 from polarnet.simulation.presets import MOTIONS
@@ -244,3 +247,13 @@ def test_truth_at_any_time_is_that_of_the_stretched_scene(images, tmp_path):
     name = scenes.sequences[0]
     result = sequence_at(scenes, name, [], frames.t_us(name))
     torch.testing.assert_close(result.dolp, frames.frames(name, 1).dolp, atol=1e-4, rtol=0)
+
+
+def test_a_log_shows_the_progress_inside_a_part_of_a_store(images, simulated, tmp_path, progress_log):
+    synthesis, mapper = Synthesis(images, CONFIG, 1, SEQUENCES_PER_PART), functools.partial(pmap, workers=1)
+    synthesize(synthesis, tmp_path / "scenes", tmp_path / "frames", functools.partial(mapper, label="synthesize"))
+    emulate = functools.partial(mapper, label="emulate")
+    emulate_scenes(simulated.scenes, tmp_path / "events", simulated.camera, simulated.seed, emulate, 1)
+    lines = progress_log()
+    for label, parts in (("synthesize", 5), ("emulate", 2)):
+        assert any(line.startswith(f"{label}: ") and f"| 0.5/{parts} [" in line for line in lines), lines

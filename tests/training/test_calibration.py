@@ -188,3 +188,12 @@ def test_a_training_ends_with_it_even_if_killed_before(stores, tmp_path, task_of
     _, metadata = load_network(tmp_path / "whole" / "out" / "best.safetensors")
     assert metadata["expected_errors"] == said
     assert "expected_errors" not in json.loads(whole["last.json"])
+
+
+def test_a_log_shows_the_progress_of_training_validation_and_expected_errors(stores, task_of, tmp_path, progress_log):
+    run(task_of(), stores, tmp_path, TRAIN)
+    lines = progress_log()
+    for start in ("epoch 1/2", "epoch 2/2", "validation", "expected errors"):
+        shown = [line for line in lines if line.startswith(f"{start}: 100%")]
+        assert shown, lines
+        assert all(("loss=" in line) == start.startswith("epoch") for line in shown)

@@ -136,8 +136,8 @@ def train_epoch(
                 sums.update(terms)
                 steps += 1
             done += len(batch.names)
+            bar.set_postfix(loss=f"{sums['total'] / steps:.4f}", refresh=False)
             bar.update(len(batch.names))
-            bar.set_postfix(loss=f"{sums['total'] / steps:.4f}")
     return {name: value / steps for name, value in sums.items()}
 
 
@@ -205,7 +205,9 @@ def validate(
     task.network.eval()
     sums, count = Counter[str](dict.fromkeys(("total", *task.loss.weights, *SCORES), 0.0)), 0
     rank, processes = place()
-    for batch in batches_of(dataset, range(rank, len(dataset), processes), 1, workers):
+    own = range(rank, len(dataset), processes)
+    batches = batches_of(dataset, own, 1, workers)
+    for batch in ProgressBar(batches, "validation", len(own), unit="sequence", disable=rank > 0):
         state = None
         for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
             with autocast(config.precision, device):
@@ -261,7 +263,8 @@ def calibrate(
     task.network.eval()
     scenes: dict[str, Scene] = {}
     mean_squared, mean_dolp = [], []
-    for batch in batches_of(dataset, range(len(dataset)), 1, workers):
+    batches = batches_of(dataset, range(len(dataset)), 1, workers)
+    for batch in ProgressBar(batches, "expected errors", len(dataset), unit="sequence"):
         scene, mse = sampled_sequence(task, batch, config, device)
         if len(scene.squared):
             scenes[batch.names[0]] = scene
