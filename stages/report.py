@@ -11,7 +11,7 @@ from polarnet.config.experiments import changed_values
 from polarnet.config.pipeline import set_folder
 from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.artefacts import ReportPaths, Run, facts, read_results, results_table
+from polarnet.reports.artefacts import ReportPaths, Run, facts, git, read_results, results_table
 from polarnet.reports.page import write_report
 from polarnet.reports.tables import as_plain
 
@@ -25,10 +25,14 @@ def plain(value: Any) -> Any:
 
 
 def command_line(root: Path) -> str:
-    """The command that makes the page again, with the values that differ from the commit's."""
+    """The command that makes the page again, with the values that differ from the commit's.
+
+    `dvc exp run` needs a commit; without one, the page's section of parameters has the values.
+    """
     if "DVC_STAGE" not in os.environ:
         return shlex.join(["python", "-m", "stages.report", *(w for w in sys.argv[1:] if not w.startswith("hydra."))])
-    changes = [word for change in changed_values(root) for word in ("-S", change)]
+    committed = git(root, "show", "HEAD:./params.yaml")
+    changes = [word for change in changed_values(root) for word in ("-S", change)] if committed else []
     return shlex.join(["dvc", "exp", "run", *changes]) if changes else "dvc repro"
 
 
