@@ -204,11 +204,19 @@ def measure_live(seconds: int) -> dict[str, Any]:
 
 
 def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
-    """Write lines, a time and a tail each, in real time; returns the process's resident MiB at each second."""
+    """Write lines, a time and a tail each, in real time; returns the process's resident MiB at each second.
+
+    They begin when the process uses no processor time for a second: it has started and waits for events.
+    """
     assert live.stdin is not None
     resident_mib, number = [], len(tails) // CHUNKS_PER_S
     digits = 10 ** np.arange(LIVE_DIGITS)[::-1]
     live.stdin.write(b"%d %d\n" % LIVE_SIZE[::-1])
+    live.stdin.flush()
+    before, used = ["not yet"], ["started"]
+    while used != before:
+        time.sleep(1)
+        before, used = used, Path(f"/proc/{live.pid}/stat").read_text().split()[13:15]
     start = time.perf_counter()
     for chunk in range(seconds * CHUNKS_PER_S):
         rows = tails[chunk % CHUNKS_PER_S * number :][:number].view(np.uint8).reshape(number, -1)
