@@ -1,13 +1,26 @@
 """Progress of work that takes longer than two seconds: a bar on a terminal, elsewhere a line every 30 s."""
 
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
 
 PATIENCE_S = 2.0  # shorter work shows nothing
 LINE_S = 30.0  # between two lines where the output is no terminal, such as a log file
+
+
+@contextmanager
+def said_after(seconds: float, message: str) -> Iterator[None]:
+    """Print `message` to standard error if the work inside takes longer than `seconds`."""
+    timer = threading.Timer(seconds, lambda: print(message, file=sys.stderr))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class ProgressBar(tqdm):
