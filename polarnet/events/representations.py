@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float32, Int8, Int16, Int64
 from torch import Tensor
 
 from polarnet.events.stream import Events
+from polarnet.runtime.compilation import compiled
 
 VOXEL_BINS = 5  # as in E2VID (Rebecq et al. 2019) and FireNet
 
@@ -65,9 +67,9 @@ def normalise_nonzero(grids: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b c h
 
 def event_counts(events: Events, window_us: int) -> Float[Tensor, "2 h w"]:
     """Per pixel, the sum of polarities (change of log intensity in contrast thresholds) and the number of events."""
-    counts = torch.zeros(events.height * events.width, device=events.p.device)
-    counts.index_add_(0, _pixel(events), torch.ones_like(events.p, dtype=counts.dtype))
-    return torch.stack([polarity_sums(events), counts.view(events.height, events.width)])
+    images = torch.zeros(2, events.height, events.width)
+    _count(*(column.cpu().contiguous().numpy() for column in (events.x, events.y, events.p)), images.numpy())
+    return images.to(events.p.device)
 
 
 def voxel_grid_of_window(events: Events, window_us: int) -> Float[Tensor, "bins h w"]:
@@ -87,6 +89,19 @@ def channels_of(encode: Encode) -> int:
     """Number of images that a representation makes of one channel's events."""
     shape = encode(Events.empty(1, 1), 1).shape
     return shape[0] if len(shape) == 3 else 1
+
+
+@compiled
+def _count(
+    x: Int16[np.ndarray, " n"],
+    y: Int16[np.ndarray, " n"],
+    p: Int8[np.ndarray, " n"],
+    images: Float32[np.ndarray, "2 h w"],
+) -> None:
+    """Add events to the images of `event_counts`; several times as fast as torch's index_add."""
+    for i in range(len(p)):
+        images[0, y[i], x[i]] += p[i]
+        images[1, y[i], x[i]] += 1
 
 
 def _pixel(events: Events) -> Int64[Tensor, " n"]:

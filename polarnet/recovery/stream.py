@@ -33,7 +33,7 @@ from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
 from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
-from polarnet.terminal.progress import ProgressBar
+from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 FILE_PIECES, LIVE_PIECES = 2, 512  # most pieces read ahead: a file has pieces of a million events, a pipe small ones
@@ -141,7 +141,8 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
         raise ValueError(
             f"expected a sensor of at least 2x2 pixels behind each polarizer, got {source.height}x{source.width}"
         )
-    warm_up(recoverer, source.height, source.width, source.channels)
+    with said_after(PATIENCE_S, "preparing the network; the first run on a machine also compiles its kernels"):
+        warm_up(recoverer, source.height, source.width, source.channels)
     cutter = WindowCutter(rule, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
     most = at_once or recoverer.at_once(source.height, source.width)

@@ -5,6 +5,7 @@ and loops over `steps`.
 """
 
 import sys
+import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -56,6 +57,17 @@ def steps(items: Collection[Item]) -> Iterator[Item]:
     for item in items:
         with within(lambda share: move(share / len(items))):
             yield item
+
+
+@contextmanager
+def said_after(seconds: float, message: str) -> Iterator[None]:
+    """Print `message` to standard error if the work inside takes longer than `seconds`."""
+    timer = threading.Timer(seconds, lambda: print(message, file=sys.stderr))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 class ProgressBar(tqdm):

@@ -1,8 +1,8 @@
 """Passes over pixels compiled by numba: the network's elementwise parts, for inference on a processor.
 
-The torch functions named in the docstrings are the definitions, used for training, on GPUs and for ONNX; `compiled_path`
-decides. Each kernel handles one window of one stream, in strips of rows that threads share. A strip's sums do not
-depend on the number of threads. Arrays are float32 and contiguous.
+The torch functions named in the docstrings are the definitions, used for training, on GPUs and for ONNX;
+`compiled_path` decides. Most kernels handle one window of one stream. Threads share strips of rows, and the sums of a
+strip do not depend on the number of threads. Arrays are float32 and contiguous.
 
 numba's OpenMP layer uses the thread pool of torch, which must be imported before. Threads of a second pool would wait
 for cores on which idle torch threads spin.
@@ -286,3 +286,52 @@ def box_means(images: Float32[np.ndarray, "c h w"], side, means: Float32[np.ndar
         for x in range(width):
             inside = (last + 1 - first) * (min(x + half, width - 1) + 1 - max(x - half, 0))
             out[x] /= F32(inside)
+
+
+@_row
+def _solve(aa, ab, bb, ac, bc, steps, ridge, least, limit, s1, s2):
+    for i in range(len(steps)):
+        added = ridge * steps[i] + least
+        a, b = max(aa[i], F32(0)) + added, max(bb[i], F32(0)) + added
+        largest = limit * np.sqrt(a * b)
+        both = max(min(ab[i], largest), -largest)
+        determinant = a * b - both * both
+        first = (bc[i] * both - ac[i] * b) / determinant
+        second = (bc[i] * a - ac[i] * both) / determinant
+        size = max(np.sqrt(first * first + second * second + F32(1e-12)), F32(1))
+        s1[i], s2[i] = first / size, second / size
+
+
+@_strips
+def least_squares(
+    moments: Float32[np.ndarray, "n c 6 p"],
+    ridge: Float32[np.ndarray, " c"],
+    least,
+    limit,
+    s1: Float32[np.ndarray, "n c p"],
+    s2: Float32[np.ndarray, "n c p"],
+):
+    """Write the solutions of `redundancy.LeastSquares` at p pixels."""
+    for row in prange(s1.shape[0] * s1.shape[1]):
+        n, c = row // s1.shape[1], row % s1.shape[1]
+        m = moments[n, c]
+        _solve(m[0], m[1], m[2], m[3], m[4], m[5], ridge[c], least, limit, s1[n, c], s2[n, c])
+
+
+@_row
+def _add_products(values, left, right, sums):
+    for j in range(len(left)):
+        sums[2 * j] += left[j] * values[2 * j]
+        sums[2 * j + 1] += right[j] * values[2 * j + 1]
+
+
+@_strips
+def add_moves(
+    sums: Float32[np.ndarray, "m 2 h w"], gains: Float32[np.ndarray, "4*m h/2 w/2"], moves: Float32[np.ndarray, "2 h w"]
+):
+    """Add one of the terms of `refinement.event_moves`; `gains` are those before `pixel_shuffle`."""
+    for y in prange(moves.shape[1]):
+        for m in range(len(sums)):
+            first = 4 * m + 2 * (y % 2)
+            for k in range(2):
+                _add_products(sums[m, k, y], gains[first, y // 2], gains[first + 1, y // 2], moves[k, y])

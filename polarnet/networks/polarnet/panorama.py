@@ -17,8 +17,11 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional as F
+
+from polarnet.networks.polarnet import kernels
 
 MAX_EVENTS = 6.0  # limit per pixel and window in the motion search, so that a hot pixel cannot dominate
 MIN_CORRELATION = 0.1  # smallest normalised correlation of two windows at which a motion is accepted
@@ -79,7 +82,7 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     height, width = images.shape[-2:]
     images = images.clamp(-MAX_EVENTS, MAX_EVENTS)
     # large enough to avoid wrap-around and to hold every displacement of the search
-    size = _rounded(max(height, reach + 2) + reach + 1, max(width, reach + 2) + reach + 1)
+    size = [next_fast_len(max(side, reach + 2) + reach + 1, real=True) for side in (height, width)]
     spectrum = torch.fft.rfft2(images, s=size)
     correlation = torch.fft.irfft2(spectrum[:-1] * spectrum[1:].conj(), s=size)
     correlation = torch.roll(correlation, (reach + 1, reach + 1), (-2, -1))
@@ -119,11 +122,16 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama
     height, width = changes.shape[-2:]
     size = (panorama.level.shape[-2], panorama.level.shape[-1])
     beyond = (0, size[1] - width, 0, size[0] - height)
+    own = panorama.own + changes
+    in_sight = F.pad(own.new_ones(height, width), beyond, value=memory.fade)
+    own_explained = memory.fade * panorama.explained[:, 1:2]
+    still_explained = torch.cat([*[own_explained] * 3, torch.zeros_like(own_explained)], dim=1)
+    if kernels.compiled_path(changes) and not motion.reliable.any():  # the result needs no transforms
+        level = panorama.level * in_sight
+        return Panorama(level + F.pad(own - level[..., :height, :width], beyond), own, still_explained)
     shift, reliable = _shift(motion, size), motion.reliable[:, None, None, None]
     expected = _expected(size, memory, changes)
-    level = torch.fft.irfft2(torch.fft.rfft2(panorama.level) * shift, s=size)
-    level = level * F.pad(level.new_ones(height, width), beyond, value=memory.fade)
-    own = panorama.own + changes
+    level = torch.fft.irfft2(torch.fft.rfft2(panorama.level) * shift, s=size) * in_sight
 
     across, down = motion.displacement.abs().unbind(-1)
     entered = (across / width + down / height).clamp(max=1)[:, None, None, None]
@@ -144,8 +152,6 @@ def follow(changes: Float[Tensor, "b c h w"], motion: Motion, panorama: Panorama
     of_own = of_own - own_alone.abs().square() / spread
     explained = expected - torch.cat([of_level, of_own, of_both.real, of_both.imag], dim=1)
 
-    own_explained = memory.fade * panorama.explained[:, 1:2]
-    still_explained = torch.cat([*[own_explained] * 3, torch.zeros_like(own_explained)], dim=1)
     still = Panorama(level + F.pad(difference, beyond), own, still_explained)
     followed = Panorama(level + to_level, own - to_own, explained)
     return Panorama(*(torch.where(reliable, a, b) for a, b in zip(followed, still, strict=True)))

@@ -14,8 +14,10 @@ least-squares problem ("errors in variables"); `SecondMoments` subtracts the exp
 same equation holds for differences between neighbouring pixels, given an image of each log I_k: `SlopeMoments`.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -116,6 +118,16 @@ class LeastSquares(nn.Module):
         self, moments: Float[Tensor, "n m d k 6 h w"]
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n c h w"], Float[Tensor, "n c h w"]]:
         """Return s1 and s2, with hypot(s1, s2) <= 1, and the weighted number of steps behind them; c = m * d * k."""
+        if kernels.compiled_path(moments):
+            n, *candidates, _, height, width = moments.shape
+            s1, s2 = moments.new_empty(2, n, math.prod(candidates), height, width)
+            ridges, limits = (
+                self.log_ridge.exp().flatten().numpy(),
+                np.array([MIN_EVIDENCE, MAX_CORRELATION], np.float32),
+            )
+            flat = moments.flatten(1, 3).flatten(-2).contiguous()
+            kernels.least_squares(flat.numpy(), ridges, *limits, s1.flatten(-2).numpy(), s2.flatten(-2).numpy())
+            return s1, s2, moments[:, :, :, :, -1].flatten(1, 3)
         aa, ab, bb, ac, bc, steps = moments.unbind(4)
         ridge = self.log_ridge.exp()[..., None, None] * steps + MIN_EVIDENCE
         aa, bb = F.relu(aa) + ridge, F.relu(bb) + ridge

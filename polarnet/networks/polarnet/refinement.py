@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.base.blocks import enlarged
+from polarnet.networks.polarnet import kernels
 from polarnet.networks.polarnet.redundancy import block_means, box_means, faded, length
 
 KEPT = 0.98  # decay of the counts per window
@@ -106,17 +107,32 @@ def wide_differences(
     return [faded(means.unsqueeze(2), keep, state) for means, state in zip(near, before, strict=True)]
 
 
-def moved_by_events(
-    stokes: Float[Tensor, "n 2 h w"],
-    sums: Sequence[Float[Tensor, "t b m 2 h w"]],
-    scale: Float[Tensor, "n 1 1 1"],
-    gains: Float[Tensor, "n g h w"],
+def event_moves(
+    sums: Sequence[Float[Tensor, "t b m 2 h w"]], gains: Float[Tensor, "n g h w"]
 ) -> Float[Tensor, "n 2 h w"]:
-    """Update (s1, s2) by adding gains times event sums times their scale to atanh(s1) and atanh(s2)."""
-    moves = stokes.new_zeros(())
+    """Return the sums of gains times event sums."""
+    moves = gains.new_zeros(())
     for gain, near in zip(gains.contiguous().chunk(len(sums), dim=1), sums, strict=True):
         moves = torch.addcmul(moves, gain.unflatten(1, (-1, 1)), near.flatten(0, 1))
-    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + scale * moves.sum(1))
+    return moves.sum(1)
+
+
+def compiled_event_moves(
+    sums: Sequence[Float[Tensor, "t b m 2 h w"]], y: Float[Tensor, "n c h/2 w/2"], layer: nn.Conv2d
+) -> Float[Tensor, "n 2 h w"]:
+    """Return `event_moves` for the gains that a 1x1 convolution computes for 2x2 pixels at once, with the kernel."""
+    assert layer.bias is not None
+    moves = torch.zeros(len(y), *sums[0].shape[-3:])
+    for n, pixels in enumerate(y.permute(0, 2, 3, 1)):
+        gains = torch.addmm(layer.bias[:, None], layer.weight.flatten(1), pixels.flatten(0, 1).T).float()
+        for gain, near in zip(gains.unflatten(1, pixels.shape[:2]).chunk(len(sums)), sums, strict=True):
+            kernels.add_moves(near.flatten(0, 1)[n].numpy(), gain.numpy(), moves[n].numpy())
+    return moves
+
+
+def moved_by_events(stokes: Float[Tensor, "n 2 h w"], moves: Float[Tensor, "n 2 h w"]) -> Float[Tensor, "n 2 h w"]:
+    """Update (s1, s2) by adding moves to atanh(s1) and atanh(s2)."""
+    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves)
 
 
 def averaged(

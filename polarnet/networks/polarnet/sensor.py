@@ -101,6 +101,7 @@ class Equaliser(nn.Module):
     ) -> tuple[Equalised, list[Tensor]]:
         """Same as `forward`, with the kernels."""
         noise, pull, surplus = (p.exp().numpy() for p in (self.log_noise, self.log_pull, self.log_surplus))
+        polarity, count = polarity.contiguous(), count.contiguous()
         totals, change = state or [polarity.new_zeros(1, 8, *polarity.shape[-2:]) for _ in range(2)]
         height, width = (size // BLOCK for size in polarity.shape[-2:])
         limits = np.array(WEIGHTS, np.float32)

@@ -213,7 +213,7 @@ class StokesUNet(nn.Module):
 
     def solve_windows(self, inputs: Float[Tensor, "t b 8 h w"], state: list[Tensor]) -> tuple[Solved, list[Tensor]]:
         """First half of `unroll`: everything before the recurrent layers. `state` is empty at the start."""
-        t, b, _, height, width = inputs.shape
+        b, height, width = inputs.shape[1], *inputs.shape[-2:]
         noise, isolated = refinement.isolated_events(inputs[:, :, 1::IMAGES], state[:NOISE_TENSORS])
         side = STRIDE * self.binning
         inputs = block_means(F.pad(inputs, (0, -width % side, 0, -height % side)), self.binning)  # no events in padding
@@ -256,9 +256,12 @@ class StokesUNet(nn.Module):
         weights = self.choose(y4).float().softmax(1)  # of the candidates, and of the constant, which is DoLP alone
         s1, s2, dolp = ((weights[:, :-1] * field).sum(1, keepdim=True) for field in candidates[:3])
         coarse = blocks.enlarged(torch.cat([s1, s2, dolp + weights[:, -1:] * self.constant], dim=1), 4)
-        gains = self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float())
+        if kernels.compiled_path(scale) and not self.without:
+            moves = refinement.compiled_event_moves(sums, y2, self.gains)
+        else:
+            moves = refinement.event_moves(sums, self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float()))
         level = refinement.moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
-        moved = refinement.moved_by_events(level, sums, scale, gains)
+        moved = refinement.moved_by_events(level, scale * moves)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * blocks.enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(refinement.averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
@@ -311,13 +314,14 @@ class StokesUNet(nn.Module):
         images = torch.empty(t * b, 4 * memories + 1, height, width, dtype=torch.uint16 if half else torch.float32)
         noise = self.moments.factors().numpy()
         before = torch.zeros_like(steps[0]) if before is None else before
+        polarity, count = polarity.contiguous(), count.contiguous()
         for n in range(t * b):
             k, stream = divmod(n, b)
             kernels.sums_and_moments(
                 (before if k == 0 else steps[k - 1])[stream].numpy(),
                 polarity[k, stream].numpy(),
                 count[k, stream].numpy(),
-                scale[n].numpy().item(),
+                scale[n].numpy()[0, 0, 0],
                 self.memories.numpy(),
                 noise,
                 half,
@@ -368,7 +372,7 @@ class StokesUNet(nn.Module):
             events = torch.cat([before[None], polarity.sum(2)])
             motion = panoramas.displacements(events, self.reach)
             height, width = (size // 2 for size in sensor)
-            changes = block_means(blocks.contrasts(polarity) / 2, 2)[..., :height, :width]
+            changes = blocks.contrasts(block_means(polarity, 2))[..., :height, :width] / 2
             panorama, after = Panorama(level, own[..., :height, :width], explained), []
             for change, displacement, reliable in zip(changes, motion.displacement / 2, motion.reliable, strict=True):
                 panorama = panoramas.follow(change, Motion(displacement, reliable), panorama, self.memory)
