@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import slice_time
-from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule, join_windows
 from polarnet.methods import METHODS
 from polarnet.methods.method import Recoverer
 from polarnet.methods.overlap import advance, begin, of_any_length, warm_up
@@ -128,3 +128,14 @@ def test_every_event_counts_once_in_the_series_that_ends_with_a_window_and_windo
     torch.testing.assert_close(torch.cat(frames), together.dolp)
     _, whole = ours.step(ours.start(18, 20), sequence.windows)
     torch.testing.assert_close(together.dolp[3::4], whole.dolp, atol=1e-4, rtol=1e-4)
+
+
+def test_windows_joined_for_want_of_time_stay_whole_and_hold_each_event_once(sequence, ours):
+    overlapping = windows_of(sequence, WindowRule(WINDOW_US, None, 500))
+    joined = join_windows(overlapping)
+    assert (joined.start_us, joined.stop_us, joined.joined) == (0, overlapping[-1].stop_us, len(overlapping))
+    for channel, events in zip(joined.channels, sequence.events, strict=True):
+        assert torch.equal(channel.t, slice_time(events, 0, joined.stop_us).t)
+    any_length = of_any_length(ours, TRAINED_US)
+    _, one_step = ours.step(ours.start(18, 20), [joined])
+    torch.testing.assert_close(any_length.step(any_length.start(18, 20), [joined])[1].dolp, one_step.dolp)
