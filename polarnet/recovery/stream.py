@@ -108,8 +108,6 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
     A ValueError or FileNotFoundError says what is missing.
     """
     tune()
-    if chosen.name not in METHODS:
-        raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {chosen.name!r}")
     method = METHODS[chosen.name]
     setup = setup_of(method)
     setup = replace(setup, precision=precision_on(setup.device, chosen.precision), rotation=chosen.rotation)

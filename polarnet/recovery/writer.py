@@ -31,11 +31,11 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map, write_player
+from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_player
 from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
-from polarnet.storage.frames import FRAMES_PER_CHUNK
+from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
@@ -44,9 +44,9 @@ VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
-SHEET_PICTURES = 3  # pictures in recovered.png
 GAP = 4  # pixels between the maps of a picture
 DOLP, INTENSITY, ANGLE, EVENTS = "DoLP", "intensity", "AoLP (hue), DoLP (saturation)", "events"  # captions
+RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",
     "dolp": "degree of linear polarization, divided by 65535",
@@ -57,12 +57,11 @@ ZARR_CONVENTIONS = {
 
 
 class Picture(NamedTuple):
-    """The maps of one frame side by side, and the end of its window."""
+    """The maps of one frame, and the end of its window."""
 
     t_us: int
-    pixels: UInt8[np.ndarray, "h w 3"]
-    maps: Mapping[Kind, UInt8[Tensor, "h w"]]
-    """The maps as bytes (`polarnet.storage.panels`), for the page."""
+    maps: Mapping[tuple[str, Kind], UInt8[Tensor, "h w"]]
+    """The maps as bytes (`polarnet.storage.panels`) by source and kind, for the page."""
 
 
 @dataclass
@@ -82,9 +81,10 @@ class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
     `outputs` is a subset of zarr, png and mp4. The folder gets recovered.zarr, png/*.png and recovered.mp4
-    (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png.
+    (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png,
+    the video's picture of the last frame.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
-    polarization at full value. `truth` is shown in the video beside each frame.
+    polarization at full value. `truth` is shown in the video and on the page beside each frame.
     """
 
     def __init__(
@@ -103,6 +103,7 @@ class RecoveryWriter:
         self._sample = _Sample([])
         self._scale = EventScale()
         self._sheet: Sheet | None = None
+        self._latest: tuple[EventWindow, Prediction, Captioned] | None = None
         self._arrays = GrowingColumns(folder / "recovered.zarr", FRAMES_PER_CHUNK, False, ZARR_CONVENTIONS)
         self._video = VideoWriter(folder / VIDEO, video_rate_hz)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
@@ -133,11 +134,8 @@ class RecoveryWriter:
     def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""
         pictures = self._sample.pictures
-        if pictures:
-            margin = ((GAP, GAP), (GAP, GAP), (0, 0))
-            places = np.linspace(0, len(pictures) - 1, SHEET_PICTURES + 2).round().astype(int)[1:-1]
-            sheet = [np.pad(pictures[k].pixels, margin, constant_values=255) for k in np.unique(places)]
-            (self.folder / "recovered.png").write_bytes(encode_png(np.concatenate(sheet)))
+        if self._latest is not None:
+            (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
         video = VIDEO if "mp4" in self.outputs and self.frames else None
         films = [_film(source, pictures)] if pictures else []
         title = f"{'Intensity' if self._plain else 'DoLP'} from events: {source}"
@@ -157,15 +155,14 @@ class RecoveryWriter:
             return
         events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
         maps = _coloured(prediction, event_image(events, self._scale.after(events)))
+        self._latest = window, prediction, maps
         if "mp4" in self.outputs:
             self._video.add(self._labelled(window, prediction, maps))
-        if not sampled and "png" not in self.outputs:
-            return
-        picture = _side_by_side(maps)
         if sampled:
-            self._sample.offer(Picture(window.stop_us, picture, _byte_maps(events, prediction)))
+            true = None if self._truth is None else self._truth.at(window.stop_us)
+            self._sample.offer(Picture(window.stop_us, _byte_maps(events, prediction, true)))
         if "png" in self.outputs:
-            _write_png(self.folder / "png" / f"{number:06d}.png", picture)
+            _write_png(self.folder / "png" / f"{number:06d}.png", _side_by_side(maps))
 
     def _labelled(self, window: EventWindow, prediction: Prediction, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
@@ -230,23 +227,30 @@ def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
 
-def _byte_maps(events: Float[Tensor, "h w"], prediction: Prediction) -> dict[Kind, UInt8[Tensor, "h w"]]:
-    """The maps of a frame as bytes."""
+def _byte_maps(
+    events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
+) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
+    """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
     plain = plain_intensity(prediction)
-    maps: dict[Kind, Tensor] = {"events": signed_bytes(events)}
+    maps: dict[tuple[str, Kind], Tensor] = {("Events", "events"): signed_bytes(events)}
+    if true is not None:
+        maps |= {
+            (TRUTH, "s0"): fraction_bytes(true.s0),
+            (TRUTH, "aolp"): angle_bytes(true.aolp),
+            (TRUTH, "dolp"): fraction_bytes(true.dolp),
+        }
     if plain is not None:
-        return maps | {"s0": fraction_bytes(plain)}
-    if prediction.intensities is not None:
-        maps["s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
-    maps["dolp"] = fraction_bytes(prediction.dolp)
-    return maps if prediction.aolp is None else maps | {"aolp": angle_bytes(prediction.aolp)}
+        return maps | {(RECOVERED, "s0"): fraction_bytes(plain)}
+    if prediction.intensities is not None and true is None:
+        maps[RECOVERED, "s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
+    maps[RECOVERED, "dolp"] = fraction_bytes(prediction.dolp)
+    return maps if prediction.aolp is None else maps | {(RECOVERED, "aolp"): angle_bytes(prediction.aolp)}
 
 
 def _film(source: str, pictures: Sequence[Picture]) -> Film:
-    """The film of a recovery for the page's player."""
-    maps = [
-        Map("recovered", kind, torch.stack([one.maps[kind] for one in pictures]).numpy()) for kind in pictures[0].maps
-    ]
+    """The film of a recovery for the page's player; the truth if every frame has it."""
+    names = [name for name in pictures[0].maps if all(name in one.maps for one in pictures)]
+    maps = [Map(*name, torch.stack([one.maps[name] for one in pictures]).numpy()) for name in names]
     return Film(source, [one.t_us for one in pictures], maps)
 
 

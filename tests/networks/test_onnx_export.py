@@ -146,11 +146,13 @@ def refusal(capsys, *arguments: object) -> str:
     ("n.pt", [], "expected a file NAME.onnx to write, got"),
     ("none/n.onnx", [], "no folder; make it first"),
     ("n.onnx", ["--height", 0], "at least 1 pixel, got 0x180"),
-    ("n.onnx", ["--weights", "none.safetensors"], "none.safetensors is missing"),
+    ("n.onnx", ["--weights", "none.safetensors"], "none.safetensors: there is no such file or folder"),
     ("n.onnx", ["--weights", "best.pth"], "NAME.safetensors, got"),
 ])  # fmt: skip
-def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, out, arguments, message):
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, monkeypatch, capsys, out, arguments, message):
     small = save_small("polarnet", tmp_path)
+    (tmp_path / "best.pth").touch()
+    monkeypatch.chdir(tmp_path)
     assert message in refusal(capsys, tmp_path / out, "--weights", small, *arguments)
 
 
