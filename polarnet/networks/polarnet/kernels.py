@@ -9,6 +9,7 @@ for cores on which idle torch threads spin.
 """
 
 import math
+import threading
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ F32 = np.float32
 SIDE = 4  # pixels of a block along each axis
 TILE = 64  # pixels of a row that are processed together, in fast memory
 SQRT_HALF_BITS = np.int32(0x3F3504F3)
+_RUNNING = threading.Lock()
 FAST = {"contract", "nnan", "nsz"}  # which vectors need, and which keep the order of sums
 
 
@@ -36,7 +38,17 @@ def _row(kernel):
 
 
 def _strips(kernel):
-    return compiled(kernel, fastmath=FAST, parallel=True)
+    """Compile a kernel whose strips threads share.
+
+    One runs at a time: where there is no OpenMP, numba's own threads end the process if two calls meet.
+    """
+    shared = compiled(kernel, fastmath=FAST, parallel=True)
+
+    def alone(*arguments):
+        with _RUNNING:
+            shared(*arguments)
+
+    return alone
 
 
 @_row
