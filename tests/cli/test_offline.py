@@ -11,7 +11,7 @@ pytestmark = pytest.mark.thorough
 
 APART = ["unshare", "--net", "--map-root-user"]
 """Runs a command in a network namespace of its own, whose one interface is down."""
-SIZE = ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.1"]
+SIZE = ["synthesize.sensor_height=60", "synthesize.sensor_width=90", "synthesize.duration_s=0.3"]
 REST = [word for word in SMALL if not word.startswith(("synthesize.", "ingest."))]
 WORK = """
 import json, os, sys
