@@ -18,8 +18,8 @@ mean; then means over scenes:
 their motion in turns. With L the images, P_k the bilinear view of the sensor at time k, N the ON and OFF events of a
 pixel so far, c the thresholds and b a pixel's unknown start: P_k L - b = g_on c N_on(k) - g_off c N_off(k) + noise. The
 thresholds' errors g ~ N(1, mismatch) and b are integrated out at each pixel, so L is one linear problem, solved by
-conjugate gradients. The covariance of a pixel comes from the events of the other three channels: with its own events,
-whose noise it shares, contrasts shrink to half.
+conjugate gradients. The covariance of a pixel comes from the events of the other three channels. Its own events share
+the noise of its sums, which would shrink contrasts.
 """
 
 import statistics

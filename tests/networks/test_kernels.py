@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import pytest
 import torch
+from test_stokes_unet import network
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -15,18 +16,9 @@ from polarnet.config.tree import load
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
 from polarnet.networks.polarnet import kernels
-from polarnet.networks.polarnet.stokes_unet import StokesUNet
 
 CONFIG = replace(load(Path(__file__).resolve().parents[2]).networks.polarnet, channels=[8, 8, 8])
 SIZES = [(40, 72), (37, 70), (5, 3)]
-
-
-def network(**changes: Any) -> StokesUNet:
-    torch.manual_seed(0)
-    built = StokesUNet(replace(CONFIG, **changes))
-    for last in (built.choose, built.gains, built.add, built.trust, built.scale.out):  # which begin with zeros
-        torch.nn.init.normal_(last.weight, std=0.1)
-    return built.eval()
 
 
 def counts(height: int, width: int, windows: int = 4) -> Tensor:
@@ -58,7 +50,7 @@ def assert_close(compiled: Any, defined: Any) -> None:
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("changes", [{}, {"binning": 2}, {"without": ["sensitivity"]}], ids=str)
 def test_maps_and_states_of_the_kernels_are_those_of_the_torch_code(size, changes):
-    built, windows = network(**changes), counts(*size)
+    built, windows = network(CONFIG, **changes), counts(*size)
     state: list[Tensor] = []
     for inputs in windows.split(2):
         defined, defined_state = built.unroll(inputs, state)
@@ -71,7 +63,7 @@ def test_maps_and_states_of_the_kernels_are_those_of_the_torch_code(size, change
 
 @torch.no_grad()
 def test_the_kernels_give_the_same_bytes_on_any_number_of_threads():
-    built, before = network(), numba.get_num_threads()
+    built, before = network(CONFIG), numba.get_num_threads()
     results = []
     for threads in {1, before}:
         numba.set_num_threads(threads)
@@ -82,7 +74,7 @@ def test_the_kernels_give_the_same_bytes_on_any_number_of_threads():
 
 
 def test_images_in_bfloat16_are_those_of_the_torch_code_rounded():
-    built, inputs = network(), counts(40, 72, windows=1)
+    built, inputs = network(CONFIG), counts(40, 72, windows=1)
     polarity, count = inputs.unflatten(2, (4, 2)).unbind(3)
     with torch.no_grad():
         _, _, images = built._event_sums(polarity, count, torch.ones(1, 1, 1, 1), None)

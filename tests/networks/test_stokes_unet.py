@@ -10,7 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from polarnet.config.tree import load
 from polarnet.networks.paper.dolp_unet import DolpUNet
 from polarnet.networks.polarnet.redundancy import block_means
-from polarnet.networks.polarnet.stokes_unet import PARTS, StokesUNet
+from polarnet.networks.polarnet.stokes_unet import PARTS, StokesUNet, StokesUNetConfig
 
 PARAMETERS = load(Path(__file__).resolve().parents[2]).networks
 CONFIG = replace(
@@ -24,9 +24,9 @@ CONFIG = replace(
 )
 
 
-def network(**changes: Any) -> StokesUNet:
+def network(config: StokesUNetConfig = CONFIG, **changes: Any) -> StokesUNet:
     torch.manual_seed(0)
-    built = StokesUNet(replace(CONFIG, **changes))
+    built = StokesUNet(replace(config, **changes))
     for last in (built.choose, built.gains, built.add, built.trust, built.scale.out):  # which begin with zeros
         torch.nn.init.normal_(last.weight, std=0.1)
     return built.eval()
