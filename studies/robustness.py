@@ -8,8 +8,8 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 
-`ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
-`train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
+`registered` is the network over the whole recording, with the first weights, `ours, 2x2 blocks` the network on blocks of
+pixels, and `ours, thresholds given` with the sensor's contrast thresholds. `train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
 sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
 docs/results/robustness.json. The second command fills --training with links to the training photographs of both
@@ -45,7 +45,7 @@ from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 from studies.study import arguments_of, command_line, machine_record, write_section
 
-OURS = "ours"
+OURS, WHOLE = "ours", "registered"
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -119,7 +119,7 @@ def contexts_of(
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
     config = settings(*overrides)
-    contexts = {row: context_of(config, [*ROWS, OURS], train_mean, file) for row, file in weights.items()}
+    contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in weights.items()}
     variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
@@ -140,6 +140,7 @@ def scored_sequence(
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
+    predictions |= predictions_of([WHOLE], test, first_context)
     warmup = warmup_windows(config)
     scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
@@ -273,7 +274,7 @@ def main() -> None:
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
     tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set)
-    figures = headlines(tables, next(iter(arguments.weights)))
+    figures = headlines(tables, next(iter(arguments.weights))) | {"whole_file": headlines(tables, WHOLE)}
     print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}

@@ -1,13 +1,16 @@
 """A short test sequence, and every method with networks that nobody trained."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
 from polarnet.benchmark.rows import Context
 from polarnet.benchmark.sequences import TestSequence
+from polarnet.config.tree import load
 from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events
-from polarnet.methods import METHODS
+from polarnet.methods import METHODS, ROWS
 from polarnet.methods.complementary_filter import FilterConfig
 from polarnet.methods.method import GainConfig, Setup, SharpeningConfig
 from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig
@@ -33,6 +36,8 @@ SECTIONS = {
     "highpass": FilterConfig(0.06, 0.06, 0.1, -0.1, [-0.5, 1.5]),
     "rotating_polarizer": RotatingPolarizerConfig(0.2, 0.2, 300.0, 60.0, 0.01, 0.1, 5, 1.3, 0.0026),
 }
+WITH_WEIGHTS_HERE = [name for name in ROWS if name != "registered"]  # which needs network polarnet
+REGISTRATION = load(Path(__file__).resolve().parents[1]).methods.registration
 
 
 def random_events(generator, windows=4, count=300):
@@ -100,6 +105,7 @@ def make_setup(checkpoints):
             "weights": checkpoints.get(section),
             "sharpening": SharpeningConfig(0.3, 1.0),
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
+            "registration": REGISTRATION,
             "device": torch.device("cpu"),
             "precision": "fp32",
             "rotation": steady_rotation(500.0),

@@ -28,8 +28,10 @@ FLOPS = flop_registry | {
 
 def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
     """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
-    network = opened(METHODS[row], context).network if row in METHODS else None
-    few, many = first_windows(sequence, COUNTED_WINDOWS), first_windows(sequence, TIMED_WINDOWS)
+    recoverer = opened(METHODS[row], context) if row in METHODS else None
+    network = recoverer.network if recoverer else None
+    timed = recoverer.at_once(*sequence.dolp.shape[-2:]) if recoverer and recoverer.sees_ahead else TIMED_WINDOWS
+    few, many = first_windows(sequence, COUNTED_WINDOWS), first_windows(sequence, timed)
     predictions_of([row], few, context)  # compiles and allocates
     with _Flops() as flops:
         predictions_of([row], few, context)

@@ -54,12 +54,13 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
 
 
 def _run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
-    """DoLP, AoLP and expected error over consecutive windows, one window at a time as from a camera."""
+    """DoLP, AoLP and expected error over consecutive windows, one at a time as from a camera, or as from a file."""
     first = windows[0].channels[0]
     state = recoverer.start(first.height, first.width)
+    at_once = recoverer.at_once(first.height, first.width) if recoverer.sees_ahead else 1
     frames = []
-    for window in windows:
-        state, prediction = recoverer.step(state, [window])
+    for k in range(0, len(windows), at_once):
+        state, prediction = recoverer.step(state, windows[k : k + at_once])
         frames.append(prediction._replace(stokes=None, intensities=None))
     return joined(frames)
 

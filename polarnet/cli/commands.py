@@ -282,7 +282,11 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
         "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"
     )
     add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
-    add("--method", help="method of the benchmark instead of the network: cf, highpass, cf+gain, e2v, ...")
+    add(
+        "--method",
+        help="registered (the network over a whole recording, the default), ours (the network from window to window, "
+        "the default of --live and --step), or another method of the benchmark: cf, highpass, cf+gain, e2v, ...",
+    )
     add("--weights", type=input_path, metavar="FILE", help="checkpoint of the method (default: the shipped one)")
     add(
         "--thresholds", nargs=2, type=float, metavar=("ON", "OFF"),

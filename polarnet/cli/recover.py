@@ -3,6 +3,8 @@
 import argparse
 import functools
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from polarnet.cli.commands import BESIDE
@@ -15,6 +17,7 @@ from polarnet.config.tree import Config, load
 from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS
+from polarnet.methods.method import Method, Setup, why_absent
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
@@ -28,7 +31,8 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
 from polarnet.terminal.suggestions import did_you_mean
 
-DEFAULT_METHOD, ROTATING_METHOD = "ours", "rotating_polarizer"
+WHOLE_METHOD, PAST_METHOD, ROTATING_METHOD = "registered", "ours", "rotating_polarizer"
+"""Methods unless --method names one: over a whole recording, from window to window, and with one polarizer."""
 RECONSTRUCT = "highpass"
 """Method whose intensities are the S0 of the video."""
 NETWORK_WINDOW = "33.333ms"
@@ -47,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
     config = load(settings_root(), [f"runtime.device={options.device}"])
     setup = functools.partial(setup_of, config)
     source, rotation, rule = _rotating(options)
-    method = options.method or (ROTATING_METHOD if rotation else DEFAULT_METHOD)
+    method = options.method or (ROTATING_METHOD if rotation else _network_method(options, setup))
     settings = options.weights, options.precision, options.thresholds, options.binning, rotation
     recoverer, words = open_method(ChosenMethod(method, *settings), setup)
     truth = _truth_of(options)
@@ -87,6 +91,15 @@ def run(options: argparse.Namespace) -> None:
     for note in notes:
         print(f"polarnet recover: warning: {note}", file=sys.stderr)
     print(f"page        {out / page.name}")
+
+
+def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Setup]) -> str:
+    """The network over the whole recording, or from window to window: live, overlapping, or with another network."""
+    if options.live or options.step:
+        return PAST_METHOD
+    whole = METHODS[WHOLE_METHOD]
+    other = options.weights and why_absent(whole, replace(setup_of(whole), weights=options.weights))
+    return PAST_METHOD if other else WHOLE_METHOD
 
 
 def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | None, WindowRule]:
@@ -136,6 +149,8 @@ def check_options(options: argparse.Namespace) -> None:
     rotating = "rotating" in stated or "triggers" in stated
     if options.live:
         refuse(options, "--live", NOT_LIVE)
+        if options.method == WHOLE_METHOD:
+            raise ValueError(f"--live: {WHOLE_METHOD} waits for the whole recording; use --method {PAST_METHOD}")
     if rotating:
         refuse(options, "--rotating", NOT_ROTATING)
     else:

@@ -47,6 +47,7 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
         weights=weights,
         sharpening=config.methods.sharpening,
         gain=config.methods.gain,
+        registration=config.methods.registration,
         device=device_of(config.runtime),
         precision=config.benchmark.precision,
         rotation=rotation,

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import EventWindow
+from polarnet.methods.registration import RegistrationConfig
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
@@ -58,6 +59,7 @@ class Setup:
     """Weights file; None if the method needs none or none is configured."""
     sharpening: SharpeningConfig
     gain: GainConfig
+    registration: RegistrationConfig
     device: torch.device
     precision: str
     """Precision of networks: fp32, or bf16 autocast."""
@@ -98,6 +100,9 @@ class Recoverer(NamedTuple):
     """The method's network; None for a filter."""
     at_once: Callable[[int, int], int] = windows_at_once
     """Height and width of a channel -> number of windows of a run (`step`), if so many are known already."""
+
+    sees_ahead: bool = False
+    """Whether the frames of a run also depend on its later windows; runs should then be as long as `at_once` says."""
 
     @torch.no_grad()
     def step(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:

@@ -125,7 +125,9 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")
-    return method.open(setup), f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}"
+    recoverer = method.open(setup)
+    whole = ", over the whole recording (--method ours: only the past)" if recoverer.sees_ahead else ""
+    return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import inspect
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+_RUNNING = threading.Lock()
 ZERO, ONE = np.int64(0), np.int64(1)
 """0 and 1 as int64 arguments of kernels: numba would compile a kernel once for a literal and once more for int64."""
 
@@ -31,6 +33,23 @@ def borrowing(kernel: Callable) -> Any:
 def inlined(kernel: Callable) -> Any:
     """Compile a small kernel into each kernel that calls it."""
     return compiled(kernel, inline="always")
+
+
+def parallel(kernel: Callable, **options: Any) -> Any:
+    """Compile a kernel whose `prange` loops threads share.
+
+    One runs at a time: where there is no OpenMP, numba's own threads end the process if two calls meet. The OpenMP
+    layer uses the thread pool of torch, which must be imported before; threads of a second pool would wait for cores
+    on which idle torch threads spin.
+    """
+    shared = compiled(kernel, parallel=True, **options)
+
+    @functools.wraps(kernel)
+    def alone(*arguments):
+        with _RUNNING:
+            shared(*arguments)
+
+    return alone
 
 
 @functools.cache

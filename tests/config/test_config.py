@@ -45,7 +45,7 @@ def edit(project: Path, old: str, new: str) -> None:
     ("override", "message"),
     [
         ("emulate.contrast_threshold_on=-0.2", r"emulate\.contrast_threshold_on: expected >= 0\.01"),
-        ("benchmark.methods=[magic]", r"benchmark\.methods\[0\]: expected one of zeros, .*, ours, got 'magic'"),
+        ("benchmark.methods=[magic]", r"benchmark\.methods\[0\]: expected one of zeros, .*, registered, got 'magic'"),
         ("networks.polarnet.reach=1000000000", r"networks\.polarnet\.reach: expected <= 1000"),
         ("network=resnet", r"network: expected one of paper"),
         ("train.epochs=many", r"^train\.epochs: expected a valid integer, got 'many'$"),

@@ -3,13 +3,9 @@
 The torch functions named in the docstrings are the definitions, used for training, on GPUs and for ONNX;
 `compiled_path` decides. Most kernels handle one window of one stream. Threads share strips of rows, and the sums of a
 strip do not depend on the number of threads. Arrays are float32 and contiguous.
-
-numba's OpenMP layer uses the thread pool of torch, which must be imported before. Threads of a second pool would wait
-for cores on which idle torch threads spin.
 """
 
 import math
-import threading
 
 import numpy as np
 import torch
@@ -17,13 +13,12 @@ from jaxtyping import Float32
 from numba import prange
 from torch import Tensor
 
-from polarnet.runtime.compilation import compiled, inlined
+from polarnet.runtime.compilation import compiled, inlined, parallel
 
 F32 = np.float32
 SIDE = 4  # pixels of a block along each axis
 TILE = 64  # pixels of a row that are processed together, in fast memory
 SQRT_HALF_BITS = np.int32(0x3F3504F3)
-_RUNNING = threading.Lock()
 FAST = {"contract", "nnan", "nsz"}  # which vectors need, and which keep the order of sums
 
 
@@ -38,17 +33,7 @@ def _row(kernel):
 
 
 def _strips(kernel):
-    """Compile a kernel whose strips threads share.
-
-    One runs at a time: where there is no OpenMP, numba's own threads end the process if two calls meet.
-    """
-    shared = compiled(kernel, fastmath=FAST, parallel=True)
-
-    def alone(*arguments):
-        with _RUNNING:
-            shared(*arguments)
-
-    return alone
+    return parallel(kernel, fastmath=FAST)
 
 
 @_row
