@@ -98,6 +98,7 @@ def errors_of(test: TestSequence, first: int) -> dict[str, float]:
     counts = encode_windows(test.events, test.t_us, event_counts).numpy()
     polarity, number = counts[:, 0::2].transpose(1, 0, 2, 3), counts[:, 1::2].transpose(1, 0, 2, 3)
     panorama = register(np.stack([number + polarity, number - polarity], axis=1) / 2, config.methods.registration)
+    assert panorama is not None, "the test scenes move"
     found = contrasts(panorama, size, first + 1)
     true_offset = np.array([np.median((t - o)[valid]) for t, o in zip(truth, found, strict=True)])
 

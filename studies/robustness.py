@@ -8,8 +8,9 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 
-`registered` is the network over the whole recording, with the first weights, `ours, 2x2 blocks` the network on blocks of
-pixels, and `ours, thresholds given` with the sensor's contrast thresholds. `train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
+`registered` is the network over the whole recording, with the first weights; `ours, 2x2 blocks` is the network on
+blocks of pixels, and `ours, thresholds given` with the sensor's contrast thresholds. `train_mean` is the mean DoLP of
+the training photographs, `constant_real` that of the measured scenes of all other
 sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
 docs/results/robustness.json. The second command fills --training with links to the training photographs of both

@@ -21,11 +21,10 @@ from polarnet.events.representations import event_counts
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.dolp_network import METHODS as NETWORKS
 from polarnet.methods.method import Method, Recoverer, Setup, State, each_map, joined
-from polarnet.methods.registration import RegistrationConfig, mosaic, offset_field, register, views
+from polarnet.methods.registration import RegistrationConfig, mosaic, offset_field, register, unexplained, views
 from polarnet.stokes import Prediction
 
 FEWEST = 8  # windows in which a panorama can be found
-SHORTEST_PATH = 4.0  # pixels; a scene that moves less is not compared with itself
 MAX_S = 0.98  # limit of s1 and s2, so that atanh is finite
 
 OURS = next(method for method in NETWORKS if method.name == "ours")
@@ -77,30 +76,38 @@ def registered(known: Past, config: RegistrationConfig) -> Prediction | None:
     """Join the network's maps with the panorama of the same windows; None if the scene moves too little for one.
 
     With s the joined (s1, s2), DoLP^2 is |s|^2 plus the variance of the network's own (s1, s2) along the motion. The
-    network's DoLP is its expectation, so its average vectors are shorter than that.
+    network's DoLP is its expectation, so its average vectors are shorter than that. Where the panorama does not explain
+    the events, the network's maps stay.
     """
     if len(known.counts) < FEWEST:
         return None
     polarity, number = known.counts.unflatten(1, (4, 2)).permute(2, 1, 0, 3, 4).numpy()
-    panorama = register(np.stack([number + polarity, number - polarity], axis=1) / 2, config)
-    x, y, size = panorama.x[1:], panorama.y[1:], number.shape[-2:]
-    if np.hypot(np.ptp(x), np.ptp(y)) < SHORTEST_PATH:
+    counts = np.stack([number + polarity, number - polarity], axis=1) / 2
+    panorama = register(counts, config)
+    if panorama is None:
         return None
     assert known.predicted is not None
     dolp, aolp, log_variance = (field.cpu().float() for field in known.predicted[:3] if field is not None)
-    stokes = MAX_S * dolp * torch.stack([torch.cos(2 * aolp), torch.sin(2 * aolp)])
-    maps = torch.cat([torch.atanh(stokes), dolp.square()[None], log_variance[None]])
+    own = dolp * torch.stack([torch.cos(2 * aolp), torch.sin(2 * aolp)])
+    maps = torch.cat([torch.atanh(MAX_S * own), dolp.square()[None], log_variance[None]])
     means, weight = mosaic(maps.numpy(), torch.exp(-log_variance).numpy(), panorama)
     found = float(known.steps.mean()) * (panorama.images[:2] - panorama.images[2:]) / 2
     found += offset_field(means[:2] - found, weight, panorama, config)
-    together = config.share * found + (1 - config.share) * means[:2]
-    s, of_network, (square, log_variance) = (
-        torch.from_numpy(views(images, x, y, size)) for images in (together, means[:2], means[2:])
+    joint = config.share * found + (1 - config.share) * means[:2]
+    stokes, of_network, (square, expected) = (
+        torch.from_numpy(views(images, panorama.x[1:], panorama.y[1:], number.shape[-2:]))
+        for images in (joint, means[:2], means[2:])
     )
-    s = torch.tanh(s)
+    stokes = torch.tanh(stokes)
     spread = F.relu(square - torch.tanh(of_network).square().sum(0))
-    aolp = torch.remainder(torch.atan2(s[1], s[0]) / 2, math.pi)
-    return Prediction(torch.sqrt(s.square().sum(0) + spread), aolp, log_variance, s.transpose(0, 1))
+    joint_dolp = torch.sqrt(stokes.square().sum(0) + spread)
+    all_of_it, nothing = config.unexplained
+    left = torch.from_numpy(unexplained(panorama, counts))
+    share = ((nothing - left) / (nothing - all_of_it)).clamp(0, 1)
+    s1, s2 = torch.lerp(own, stokes, share)
+    aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
+    dolp, log_variance = torch.lerp(dolp, joint_dolp, share), torch.lerp(log_variance, expected, share)
+    return Prediction(dolp, aolp, log_variance, torch.stack([s1, s2], dim=1))
 
 
 METHODS = (

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 from numba import prange
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from scipy import sparse
 from scipy.sparse.linalg import splu
 from torch.nn import functional as F
@@ -34,8 +34,10 @@ ROUNDS = (20, 10, 10, 10, 10)  # conjugate-gradient iterations on 2x2 blocks; th
 LAST_ITERATIONS = 25  # on all pixels
 MAX_MOVE = 1.0  # limit in pixels of one correction of the motion
 BLOCKS_MISMATCH, BLOCKS_ROUNDING = 0.6, 0.5  # of 2x2 blocks, relative to single pixels
+SHORTEST_PATH = 4.0  # pixels
 BLOCK = 4  # side in pixels of the blocks that have an offset
-UNSEEN = 1e-4  # weight that keeps the offset of parts that were not seen finite
+UNSEEN = 1e-4  # weight of parts without events, which keeps their offsets finite
+NEAR = 9  # side in pixels of the square round a pixel whose changes are compared with the panorama's
 
 
 @section
@@ -58,6 +60,9 @@ class RegistrationConfig:
     """Stiffness of the offsets between panorama and network along the motion, relative to one block of 4x4 pixels."""
     across: PositiveFloat
     """The same across the motion."""
+    unexplained: Annotated[list[NonNegativeFloat], Field(min_length=2, max_length=2)]
+    """Share of the changes that the panorama may leave unexplained: up to the first number the joined maps count
+    wholly, from the second on the network's alone."""
     windows: Annotated[int, Field(ge=2, le=10_000)]
     """Windows of a recording that are registered together, in addition to `overlap` earlier ones."""
     overlap: Annotated[int, Field(ge=0, le=10_000)]
@@ -93,12 +98,16 @@ def _pixels(events: np.ndarray, config: RegistrationConfig, mismatch: float, rou
     return _Pixels(events, series, smoothness, smoothness * config.contrast_smoothness)
 
 
-def register(counts: Float32[np.ndarray, "4 2 k h w"], config: RegistrationConfig) -> Panorama:
-    """The panorama of a recording, from the numbers of ON and OFF events of each pixel and window."""
-    events = np.zeros((4, 2, counts.shape[2] + 1, *counts.shape[3:]), np.float32)
-    events[:, :, 1:] = counts.cumsum(2)
-    height, width = events.shape[-2:]
+def register(counts: Float32[np.ndarray, "4 2 k h w"], config: RegistrationConfig) -> Panorama | None:
+    """The panorama of a recording, from the numbers of ON and OFF events of each pixel and window.
+
+    None if the scene moves less than SHORTEST_PATH, too little to be compared with itself.
+    """
     x, y = _summed_displacements(counts, config.reach)
+    if np.hypot(np.ptp(x), np.ptp(y)) < SHORTEST_PATH:
+        return None
+    events = _sums(counts)
+    height, width = events.shape[-2:]
     size = _even(y.max() + height + 1 + MARGIN), _even(x.max() + width + 1 + MARGIN)
     blocks = events[..., : height // 2 * 2, : width // 2 * 2]
     blocks = blocks.reshape(*events.shape[:3], height // 2, 2, width // 2, 2).mean((4, 6), dtype=np.float32)
@@ -113,6 +122,27 @@ def register(counts: Float32[np.ndarray, "4 2 k h w"], config: RegistrationConfi
     start = F.interpolate(torch.from_numpy(coarse)[None, :, :-1, :-1], size, mode="bilinear")[0].numpy()
     images = _solved(_pixels(events, config, 1.0, 1.0), x, y, np.ascontiguousarray(start), LAST_ITERATIONS)
     return Panorama(images, _coverage(x, y, (height, width), size) > 0.5, x, y)
+
+
+def unexplained(panorama: Panorama, counts: Float32[np.ndarray, "4 2 k h w"]) -> Float32[np.ndarray, "h w"]:
+    """Energy of the changes that the panorama leaves over around each pixel, as a share of their energy.
+
+    Objects that move in another way than the panorama leave most of theirs.
+    """
+    changes = _changes(_sums(counts))
+    left = changes - views(panorama.images, panorama.x, panorama.y, counts.shape[-2:])
+    of_left, of_all = (
+        torch.from_numpy(np.square(one - one.mean(1, keepdims=True)).sum((0, 1)))[None] for one in (left, changes)
+    )
+    near = [F.avg_pool2d(one, NEAR, 1, NEAR // 2, count_include_pad=False)[0] for one in (of_left, of_all)]
+    return (near[0] / near[1].clamp(min=UNSEEN)).numpy()
+
+
+def _sums(counts: np.ndarray) -> Float32[np.ndarray, "4 2 k1 h w"]:
+    """Events so far, at the start and at the end of each window."""
+    events = np.zeros((4, 2, counts.shape[2] + 1, *counts.shape[3:]), np.float32)
+    events[:, :, 1:] = counts.cumsum(2)
+    return events
 
 
 def views(
@@ -145,13 +175,17 @@ def _even(length: float) -> int:
 
 def _weights(events: np.ndarray, mismatch: float, rounding: float) -> Float32[np.ndarray, "4 3 k h w"]:
     """Orthonormal series of each pixel, shrunk; the inverse covariance is that of `_weigh`, which subtracts them."""
-    steps = (events.sum(0) - events) / 3  # the other channels see nearly the same, with errors of their own
-    series = np.stack([np.ones_like(steps[:, 0]), steps[:, 0], steps[:, 1]], axis=1)
-    gram = np.einsum("cmkij,cnkij->cijmn", series, series, optimize=True).astype(np.float64)
-    prior = rounding / mismatch**2
-    gram += np.diag([1e-9, prior, prior])
-    roots = np.linalg.cholesky(np.linalg.inv(gram)).astype(np.float32)
-    return np.ascontiguousarray(np.einsum("cmkij,cijmn->cnkij", series, roots, optimize=True))
+    others = (events.sum(0) - events) / 3  # the other channels see nearly the same, with errors of their own
+    series = np.empty((4, 3, *events.shape[2:]), np.float32)
+    series[:, 0] = events.shape[2] ** -0.5
+    on, off = np.moveaxis(others - others.mean(2, keepdims=True), 1, 0)
+    prior = np.float32(rounding / mismatch**2)
+    power = np.square(on).sum(1) + prior
+    share = (on * off).sum(1) / power
+    series[:, 1] = on / np.sqrt(power)[:, None]
+    off = off - share[:, None] * on
+    series[:, 2] = off / np.sqrt(np.square(off).sum(1) + prior * (1 + share**2))[:, None]
+    return series
 
 
 def _coverage(x: np.ndarray, y: np.ndarray, size: tuple[int, int], panorama: tuple[int, int]) -> np.ndarray:

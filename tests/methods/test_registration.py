@@ -49,6 +49,7 @@ def test_motion_and_contrasts_of_a_moving_scene_are_found(simulated):
     counts = encode_windows(simulated.events, simulated.t_us, event_counts).numpy()
     polarity, number = counts[:, 0::2].transpose(1, 0, 2, 3), counts[:, 1::2].transpose(1, 0, 2, 3)
     panorama = register(np.stack([number + polarity, number - polarity], axis=1) / 2, REGISTRATION)
+    assert panorama is not None
 
     pose = simulated.trajectory.pose(simulated.t_us.numpy() * 1e-6)
     for found, true in ((panorama.x, pose.x), (panorama.y, pose.y)):
