@@ -8,8 +8,8 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 
-`registered` is the network over the whole recording, with the first weights; `ours, 2x2 blocks` is the network on
-blocks of pixels, and `ours, thresholds given` with the sensor's contrast thresholds. `train_mean` is the mean DoLP of
+`ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
+--whole-file has `registered` in their place, the network over the whole recording. `train_mean` is the mean DoLP of
 the training photographs, `constant_real` that of the measured scenes of all other
 sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
@@ -46,7 +46,7 @@ from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 from studies.study import arguments_of, command_line, machine_record, write_section
 
-OURS, WHOLE = "ours", "registered"
+OURS, WHOLE, WHOLE_FILE = "ours", "registered", "whole_file"
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -116,11 +116,13 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
 
 
 def contexts_of(
-    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path]
+    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path], whole_file: bool
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
     config = settings(*overrides)
     contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in weights.items()}
+    if whole_file:
+        return contexts
     variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
@@ -131,7 +133,7 @@ def contexts_of(
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float
+    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float, whole_file: bool
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
@@ -141,7 +143,8 @@ def scored_sequence(
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
-    predictions |= predictions_of([WHOLE], test, first_context)
+    if whole_file:
+        predictions |= predictions_of([WHOLE], test, first_context)
     warmup = warmup_windows(config)
     scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
@@ -212,6 +215,7 @@ def tables_of(
     train_mean: float,
     weights: Mapping[str, Path],
     common: Sequence[str],
+    whole_file: bool,
 ) -> dict[str, Any]:
     """Score every condition; returns its table, and one of all measured scenes. `means` has the mean DoLP by source."""
     results: dict[str, Scores] = {}
@@ -221,10 +225,15 @@ def tables_of(
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
             config = settings(*common, *overrides)
-            contexts = contexts_of(name, (*common, *overrides), train_mean, weights)
+            contexts = contexts_of(name, (*common, *overrides), train_mean, weights, whole_file)
             scenes = scenes_of(images, config)
             task = functools.partial(
-                scored_sequence, scenes=scenes, config=config, contexts=contexts, constant=constant
+                scored_sequence,
+                scenes=scenes,
+                config=config,
+                contexts=contexts,
+                constant=constant,
+                whole_file=whole_file,
             )
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
@@ -250,6 +259,7 @@ def main() -> None:
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
+    parser.add_argument("--whole-file", action="store_true", help="the row `registered` beside `ours`")
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
@@ -274,14 +284,16 @@ def main() -> None:
         conditions = {
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
-    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set)
-    figures = headlines(tables, next(iter(arguments.weights))) | {"whole_file": headlines(tables, WHOLE)}
+    whole = arguments.whole_file
+    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, whole)
+    figures = {WHOLE_FILE: headlines(tables, WHOLE)} if whole else headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
-    (arguments.work / f"robustness_{arguments.split}.json").write_text(json.dumps(section, indent=2) + "\n")
+    part = f"{WHOLE_FILE}_{arguments.split}" if whole else arguments.split
+    (arguments.work / f"robustness_{part}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
-        write_section("robustness", arguments.split, section, record, figures if arguments.split == "test" else None)
+        write_section("robustness", part, section, record, figures if arguments.split == "test" else None)
 
 
 if __name__ == "__main__":
