@@ -185,7 +185,7 @@ def measure_live(seconds: int) -> dict[str, Any]:
         store.finish()
         for name, written in (("all", ["zarr", "png", "mp4"]), ("numbers", ["zarr"])):
             outputs = ["--write", *written, "--out", f"{folder}/{name}"]
-            command = [sys.executable, "-m", "polarnet.cli", "recover", *outputs]
+            command = [sys.executable, "-m", "polarnet.cli", "recover", "--method", "ours", *outputs]
             of_file = subprocess.run([*command, f"{folder}/events.zarr"], capture_output=True, text=True, check=True)
             with tempfile.TemporaryFile("w+") as printed:
                 live = subprocess.Popen([*command, "--live", "-"], stdin=subprocess.PIPE, stdout=printed)
