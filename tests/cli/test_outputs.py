@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
