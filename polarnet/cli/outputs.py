@@ -34,6 +34,8 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
         at_end.enter_context(claimed(place))
         for each in (place, partial):
             _check_owner(each, command)
+        if (partial / WORK).exists() and place.exists() and not (place / WORK).exists():
+            (partial / WORK).rename(place / WORK)  # of a run that ended while it published
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         try:

@@ -79,6 +79,16 @@ def test_work_that_a_later_run_goes_on_from_stays(tmp_path):
     assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
 
 
+def test_work_survives_a_run_that_ends_while_it_publishes(tmp_path, monkeypatch):
+    (tmp_path / "out" / WORK).mkdir(parents=True)
+    (tmp_path / "out" / WORK / "scenes").touch()
+    with monkeypatch.context() as patched, pytest.raises(OSError, match="full"):
+        patched.setattr("polarnet.cli.outputs.publish", mock.Mock(side_effect=OSError("full")))
+        write(tmp_path / "out", "metrics.json")
+    write(tmp_path / "out", "metrics.json")
+    assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
+
+
 def test_an_export_holds_the_sequences_of_one_store(tmp_path):
     for name in ("lake", "road"):
         store = EventStore.create(tmp_path / f"{name}.zarr", [name], 4, 6, {})

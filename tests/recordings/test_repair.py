@@ -95,8 +95,8 @@ REFUSED = "time goes back by"
         ([*STEADY, *(t + 20 * 10**6 for t in STEADY)], {"pauses": 1}, None),
     ],
     ids=[
-        "sound", "late", "early", "late at the end", "early at the end", "stale", "stale before", "one wrong time", "reset",
-        "joined", "reset near the end", "small reset", "jump of two hours", "pause",
+        "sound", "late", "early", "late at the end", "early at the end", "stale", "stale before", "one wrong time",
+        "reset", "joined", "reset near the end", "small reset", "jump of two hours", "pause",
     ],
 )  # fmt: skip
 def test_the_clock_rule_is_the_same_for_files_and_live_input(times, file, live):

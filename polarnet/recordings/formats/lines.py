@@ -33,9 +33,10 @@ MAX_LINE = 2**12  # bytes
 COLUMNS = ("t", "x", "y", "p")
 PROPHESEE = ("x", "y", "p", "t")
 NAMES = {
-    **dict.fromkeys(("time", "timestamp", "ts", "t_us", "ts_us", "time_us", "timestamp_us"), "t"),
-    **dict.fromkeys(("pol", "polarity", "polarities", "on"), "p"),
-    **{"xs": "x", "col": "x", "column": "x", "ys": "y", "row": "y", "ps": "p", "times": "t", "timestamps": "t"},
+    **dict.fromkeys(("time", "times", "timestamp", "timestamps", "ts", "t_us", "ts_us", "timestamp_us"), "t"),
+    **dict.fromkeys(("xs", "col", "column"), "x"),
+    **dict.fromkeys(("ys", "row"), "y"),
+    **dict.fromkeys(("ps", "pol", "polarity", "polarities", "on"), "p"),
 }
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # at the start of text that Windows wrote
 MICROSECONDS = 6  # decimals of a second

@@ -126,7 +126,7 @@ def test_lines_that_are_no_events_are_left_out_and_counted(tmp_path, read, text,
         ("18 12\n" + "1 20 3 1\n" * 20, "events that are not on the sensor"),
         (
             "18 12\n" + "1 2 3 1\n1 ? 3 1\n" * 20,
-            r"20 lines that are not the numbers they should be \(20 events so far\)",
+            r"20 lines that are not the numbers .* \(20 events so far\)",
         ),
         ("18 12\n" + "1 " * 10_000, "bytes without the end of a line"),
         ("when,down,right,sign\n1,2,3,1\n", "expected the names t, x, y, p .*, got when, down, right, sign"),
