@@ -82,9 +82,10 @@ def test_work_that_a_later_run_goes_on_from_stays(tmp_path):
 def test_work_survives_a_run_that_ends_while_it_publishes(tmp_path, monkeypatch):
     (tmp_path / "out" / WORK).mkdir(parents=True)
     (tmp_path / "out" / WORK / "scenes").touch()
-    with monkeypatch.context() as patched, pytest.raises(OSError, match="full"):
+    with monkeypatch.context() as patched:
         patched.setattr("polarnet.cli.outputs.publish", mock.Mock(side_effect=OSError("full")))
-        write(tmp_path / "out", "metrics.json")
+        with pytest.raises(OSError, match="full"):
+            write(tmp_path / "out", "metrics.json")
     write(tmp_path / "out", "metrics.json")
     assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
 
