@@ -25,9 +25,9 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
     folder contains other files, or while another run writes to `folder`.
     """
     place = folder.resolve()
-    partial = place.with_name(f"{place.name}.partial")
     if Path.cwd().is_relative_to(place):
         raise ValueError(f"{folder}: expected a folder of its own, got the one you are in; name one below it")
+    partial = place.with_name(f"{place.name}.partial")
     absent = [each for each in (partial, *partial.parents) if not each.exists()]
     with contextlib.ExitStack() as at_end:
         at_end.callback(_remove_empty, absent[1:])

@@ -90,6 +90,13 @@ def test_work_survives_a_run_that_ends_while_it_publishes(tmp_path, monkeypatch)
     assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
 
 
+def test_no_run_takes_the_folder_one_is_in_or_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in (".", "..", "/"):
+        with pytest.raises(ValueError, match="expected a folder of its own, got the one you are in"):
+            write(Path(folder))
+
+
 def test_an_export_holds_the_sequences_of_one_store(tmp_path):
     for name in ("lake", "road"):
         store = EventStore.create(tmp_path / f"{name}.zarr", [name], 4, 6, {})
