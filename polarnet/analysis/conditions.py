@@ -1,10 +1,12 @@
 """Size, duration, motion and sensor of simulated sequences, compared with those of a network's training."""
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping
 from typing import Any
 
+from polarnet.networks.base.checkpoint import nested
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 
@@ -22,9 +24,9 @@ def trained_on(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
     """The same of a training, from the JSON of its checkpoint; None if that does not record them."""
     if "data" not in metadata:
         return None
-    data, made = metadata["data"], metadata["data"].get("events_from", {})
-    size = {"sensor_height": data["height"], "sensor_width": data["width"]}
-    return _keyed(made.get("scenes", {}).get("synthesize", {}) | size, made.get("emulate", {}))
+    size = {f"sensor_{side}": metadata["data"].get(side) for side in ("height", "width")}
+    made = functools.partial(nested, metadata, "data", "events_from")
+    return _keyed({**made("scenes", "synthesize"), **size}, made("emulate"))
 
 
 def _keyed(synthesize: Mapping[str, Any], emulate: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,15 +25,17 @@ def run_folder(folder: Path, command: str) -> Iterator[Path]:
     folder contains other files, or while another run writes to `folder`.
     """
     place = folder.resolve()
-    partial = place.with_name(f"{place.name}.partial")
     if Path.cwd().is_relative_to(place):
         raise ValueError(f"{folder}: expected a folder of its own, got the one you are in; name one below it")
+    partial = place.with_name(f"{place.name}.partial")
     absent = [each for each in (partial, *partial.parents) if not each.exists()]
     with contextlib.ExitStack() as at_end:
         at_end.callback(_remove_empty, absent[1:])
         at_end.enter_context(claimed(place))
         for each in (place, partial):
             _check_owner(each, command)
+        if (partial / WORK).exists() and place.exists() and not (place / WORK).exists():
+            (partial / WORK).rename(place / WORK)  # of a run that ended while it published
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         try:

@@ -7,7 +7,7 @@ from typing import Any
 from torch import nn
 
 from polarnet.events.representations import REPRESENTATIONS
-from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
+from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors, trained_window_us
 from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.networks.polarnet.stokes_unet import StokesUNetConfig
 
@@ -34,17 +34,19 @@ def load_network(path: str | os.PathLike[str]) -> tuple[nn.Module, dict[str, Any
             f"{path} holds a {metadata.get('network')!r}; expected a DoLP network, one of {', '.join(NETWORKS)}"
         )
     inputs, representation = metadata.get("in_channels"), metadata.get("representation")
-    if not isinstance(inputs, int) or not 0 < inputs <= MAX_CHANNELS or representation not in REPRESENTATIONS:
+    if not isinstance(inputs, int) or not 0 < inputs <= MAX_CHANNELS or representation not in [*REPRESENTATIONS]:
         raise ValueError(
             f"{Path(path).with_suffix('.json')}: expected in_channels of 1 to {MAX_CHANNELS} and a representation of "
             f"{', '.join(REPRESENTATIONS)}, got {inputs!r} and {representation!r}; train again"
         )
     try:
         config = NETWORKS[metadata["network"]](**metadata["config"])
-    except (KeyError, TypeError, ValueError) as error:
+        trained_window_us(metadata)
+    except (TypeError, ValueError) as error:
+        reason = str(error).replace("\n", "; ")
         raise ValueError(
             f"{Path(path).with_suffix('.json')}: config of another version of networks.{metadata['network']}: "
-            f"{error}; train again"
+            f"{reason}; train again"
         ) from None
     network = config.network_class(config, inputs)
     load_tensors(network, tensors, path)

@@ -84,8 +84,8 @@ def refuse_much_damage(name: str, counts: Counter[str], events: int, safe: Colle
     for kind, words in REPAIRS.items():
         if kind not in safe and counts[kind] > max(TOLERATED_COUNT, TOLERATED_SHARE * events):
             raise RecordingError(
-                f"{name}: {counts[kind]} among the first {events} events: {words.split(':')[0]}; "
-                f"so much damage is not repaired. Is the format right, and the size of the sensor?"
+                f"{name}: {counts[kind]} {words.split(':')[0]} ({events} events so far); so much damage is not "
+                f"repaired. Is the format right, and the size of the sensor?"
             )
 
 
@@ -243,13 +243,14 @@ def _judge(t, keep, started, newest, floor, dropped, few, final):
             dropped = 0
         else:
             ahead = now > newest
+            other = not ahead or now - newest > MAX_PAUSE_US  # a clock, unless it is a glitch
             back = _back(t, i, max(newest - LATE_US, floor), now - LATE_US if ahead else MAX_TIME, final)
             if back == UNKNOWN:
                 break
-            if back == NEVER and not ahead and final and dropped + len(t) - i <= min(few + i, FEW):
+            if back == NEVER and other and final and dropped + len(t) - i <= min(few + i, FEW):
                 dropped += len(t) - i
                 back = len(t)
-            if back == NEVER and (not ahead or now - newest > MAX_PAUSE_US):
+            if back == NEVER and other:
                 return i, True, started, newest, 0, counts
             if back == NEVER:
                 counts[3] += now - newest > PAUSE_US

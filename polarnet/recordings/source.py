@@ -126,9 +126,8 @@ def unpacked(path: Path) -> Iterator[Any]:
                 file = stack.enter_context(gzip.open(file))
             elif magic == ZIP:
                 archive = zipfile.ZipFile(file)
-                members = [
-                    one for one in archive.infolist() if not (one.is_dir() or one.filename.startswith("__MACOSX"))
-                ]
+                every = [one for one in archive.infolist() if not one.is_dir()]
+                members = [one for one in every if not Path(one.filename).name.startswith(".")]  # as macOS adds
                 if len(members) != 1:
                     raise RecordingError(
                         f"{path.name}: expected one recording in the zip archive, got {len(members)} files; unpack it"

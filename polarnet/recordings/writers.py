@@ -3,6 +3,7 @@
 `polarnet.recordings` reads them all.
 """
 
+import io
 import itertools
 import json
 import os
@@ -38,7 +39,7 @@ def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int 
     Polarity is 1 or 0 there; t is int64, because DSEC's uint32 ends after 71 minutes. The attributes height and width
     add the sensor's size. `duration_us` None: up to the last event. ValueError for more than 30 days. Needs h5py.
     """
-    with h5py_module().File(path, "w") as file:
+    with _Disk(path, "wb+") as disk, h5py_module().File(disk, "w") as file:
         columns = {
             name: _growing(file, f"events/{name}", dtype)
             for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8))
@@ -57,9 +58,32 @@ def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int 
                 for edges in _milliseconds(len(index), end_us // 1000 + 1):
                     _append(index, (count + np.searchsorted(t, 1000 * edges)).astype(np.uint64))
             count += len(t)
+            disk.check()
         end_us = end_us + 1 if duration_us is None else duration_us
         for edges in _milliseconds(len(index), -(-end_us // 1000) + 1):  # up to the first at or after the end
             _append(index, np.full(len(edges), count, np.uint64))
+    disk.check()
+
+
+class _Disk(io.FileIO):
+    """A file for HDF5, which crashes where a write fails: the first error is kept for `check`, later bytes are lost."""
+
+    error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """Write all bytes."""
+        rest = memoryview(data).cast("B")
+        try:
+            while len(rest) and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+    def check(self) -> None:
+        """Raise the error of a write."""
+        if self.error is not None:
+            raise self.error
 
 
 def _growing(file: Any, name: str, dtype: type[np.generic]) -> Any:

@@ -66,8 +66,11 @@ def check_name(name: str) -> str:
 def replaced(path: Path) -> Iterator[Path]:
     """PATH.tmp for the new content of a file, which only this process may write; it becomes `path` at the block's end.
 
-    After an error, `path` is as it was and PATH.tmp is gone. ValueError while another process writes the file.
+    After an error, `path` is as it was and PATH.tmp is gone. ValueError while another process writes the file, and for
+    a folder or a device such as /dev/null.
     """
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: expected the name of a file, got a folder or a device; name another")
     temporary = path.with_name(f"{path.name}.tmp")
     with claimed(path):
         temporary.unlink(missing_ok=True)  # it could be a link to a file elsewhere

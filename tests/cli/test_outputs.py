@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -76,6 +77,24 @@ def test_work_that_a_later_run_goes_on_from_stays(tmp_path):
     (tmp_path / "out" / WORK / "scenes").touch()
     write(tmp_path / "out", "metrics.json")
     assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
+
+
+def test_work_survives_a_run_that_ends_while_it_publishes(tmp_path, monkeypatch):
+    (tmp_path / "out" / WORK).mkdir(parents=True)
+    (tmp_path / "out" / WORK / "scenes").touch()
+    with monkeypatch.context() as patched:
+        patched.setattr("polarnet.cli.outputs.publish", mock.Mock(side_effect=OSError("full")))
+        with pytest.raises(OSError, match="full"):
+            write(tmp_path / "out", "metrics.json")
+    write(tmp_path / "out", "metrics.json")
+    assert names(tmp_path / "out") == ["metrics.json", MARKER, "work/scenes"]
+
+
+def test_no_run_takes_the_folder_one_is_in_or_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in (".", "..", "/"):
+        with pytest.raises(ValueError, match="expected a folder of its own, got the one you are in"):
+            write(Path(folder))
 
 
 def test_an_export_holds_the_sequences_of_one_store(tmp_path):

@@ -86,6 +86,14 @@ OTHER_CONFIG = {key: value for key, value in asdict(CONFIG).items() if key != "s
 @pytest.mark.parametrize(("changes", "message"), [
     ({"network": "firenet"}, "holds a 'firenet'; expected a DoLP network, one of paper"),
     ({"config": OTHER_CONFIG}, r"(?s)another version of networks\.paper: .*(layers.*swin_depth|swin_depth.*layers)"),
+    ({"network": []}, r"\.json: expected the name of a network and its config"),
+    ({"config": None}, r"\.json: expected the name of a network and its config"),
+    ({"config": OTHER_CONFIG | {"c": 1}}, r"\.json: config of another version of .*: .*; .*; train again$"),
+    ({"representation": []}, r"\.json: expected in_channels of 1 to 1024 and a representation of event_tensor"),
+    ({"data": []}, r"\.json: config of another .*: data: expected a record of the training, got '\[\]'"),
+    ({"data": {"events_from": {"scenes": None}}}, r"scenes: expected a record of the training, got 'None'"),
+    *(({"data": {"events_from": {"scenes": {"synthesize": {"frame_rate_hz": rate}}}}}, "frame_rate_hz: expected 0.001")
+      for rate in (0, -30, "30", float("inf"), [1], 1e-300)),
     ({"in_channels": 4}, r"c1\.weight should be \(4, 4, 3, 3\) .*, is \(4, 8, 3, 3\) .* \(1 tensors"),
 ])  # fmt: skip
 def test_a_checkpoint_of_another_network_is_refused_with_what_differs(saved, changes, message):

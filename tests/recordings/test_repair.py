@@ -64,7 +64,7 @@ def test_events_of_equal_time_keep_their_order():
 
 def test_one_wild_time_is_left_out_wherever_it_stands():
     sound = list(range(0, 10**6, 10**4))
-    for place in (0, 1, 50, 98):
+    for place in (0, 1, 50, 98, 100):
         for wild in (10**12, -(10**12), 2**62):
             rows, counts = read([at([*sound[:place], wild, *sound[place:]])])
             assert times_of(rows) == sound
@@ -83,6 +83,7 @@ REFUSED = "time goes back by"
         ([*STEADY[:1000], *range(10**6, 10**6 + 10_000, 1000), *STEADY[1000:]], {"time_glitches": 10}, None),
         ([*STEADY[:1000], *range(10**8, 10**8 + 20_000, 1000), *STEADY[1000:]], {"time_glitches": 20}, None),
         ([*STEADY, *range(10**6, 10**6 + 3000, 1000)], {"time_glitches": 3}, None),
+        ([*STEADY, *range(2 * HOUR_US, 2 * HOUR_US + 3000, 1000)], {"time_glitches": 3}, None),
         ([*range(5 * 10**9, 5 * 10**9 + 20), *STEADY], {"stale": 20}, None),
         ([*range(8), *(t + 2 * HOUR_US for t in STEADY)], {"stale": 8}, None),
         ([*STEADY[:1000], 20 * 10**6, *STEADY[1000:]], {"time_glitches": 1}, None),
@@ -94,8 +95,8 @@ REFUSED = "time goes back by"
         ([*STEADY, *(t + 20 * 10**6 for t in STEADY)], {"pauses": 1}, None),
     ],
     ids=[
-        "sound", "late", "early", "late at the end", "stale", "stale before", "one wrong time", "reset",
-        "joined", "reset near the end", "small reset", "jump of two hours", "pause",
+        "sound", "late", "early", "late at the end", "early at the end", "stale", "stale before", "one wrong time",
+        "reset", "joined", "reset near the end", "small reset", "jump of two hours", "pause",
     ],
 )  # fmt: skip
 def test_the_clock_rule_is_the_same_for_files_and_live_input(times, file, live):

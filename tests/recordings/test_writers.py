@@ -1,6 +1,7 @@
 """Files for other tools: the readers of recordings get back what went out."""
 
 import json
+import subprocess
 import sys
 
 import h5py
@@ -117,3 +118,22 @@ def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypat
 def test_an_unknown_form_is_refused(store, tmp_path):
     with pytest.raises(ValueError, match="expected a form of hdf5, text, evt3, got 'aedat'"):
         export_store(store, tmp_path, "aedat")
+
+
+def test_hdf5_on_a_full_disk_ends_with_the_error_of_the_disk_and_the_process_goes_on(tmp_path):
+    """HDF5 itself crashes then, once its objects are released."""
+    script = f"""
+import resource, torch
+from polarnet.events.stream import Events
+from polarnet.recordings.writers import write_hdf5
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
+t = torch.arange(200_000)
+events = Events(t, (t % 346).short(), (t % 260).short(), torch.ones(200_000, dtype=torch.int8), 260, 346)
+try:
+    write_hdf5({str(tmp_path / "e.h5")!r}, events, None)
+except OSError as error:
+    print(error)
+del events
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "[Errno 27] File too large\n", "")

@@ -161,6 +161,15 @@ def test_bytes_are_on_the_disk_before_the_rename_and_the_name_after_it(tmp_path,
     assert calls[place + 1 :] == [str(tmp_path)]
 
 
+def test_a_device_or_a_folder_is_not_replaced_by_a_file(tmp_path):
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("folder", "pipe"):
+        with pytest.raises(ValueError, match=rf"{name}: expected the name of a file, got a folder or a device"):
+            replaced(tmp_path / name).__enter__()
+    assert (tmp_path / "pipe").is_fifo()
+
+
 @pytest.mark.parametrize("shortage", [errno.ENOSPC, errno.EFBIG])
 @pytest.mark.parametrize("kind", [OSError, RuntimeError])
 def test_a_shortage_names_the_place_and_what_to_do(tmp_path, shortage, kind):

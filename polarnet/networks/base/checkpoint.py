@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from polarnet.runtime.files import SUMS, check_seal, replaced, sha256
 
 FORMAT = "polarnet-checkpoint-2"
+MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e5  # of a training's frames
 
 
 def save_checkpoint(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
@@ -60,6 +61,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], di
         raise ValueError(
             f"{path} is not the file that {record.name} describes, or that has changed; copy or train the pair again"
         )
+    if not (isinstance(metadata.get("network"), str) and isinstance(metadata.get("config"), dict)):
+        raise ValueError(f"{record}: expected the name of a network and its config; train the network again")
     try:
         tensors = load(content)
     except SafetensorError as error:
@@ -76,10 +79,27 @@ def _digest(content: bytes, metadata: Mapping[str, Any]) -> str:
     return sha256(content, json.dumps(plain, sort_keys=True).encode())
 
 
+def nested(metadata: Mapping[str, Any], *keys: str) -> Mapping[str, Any]:
+    """The record at nested keys of a checkpoint's metadata, empty if there is none; ValueError for another value."""
+    record = metadata
+    for key in keys:
+        record = record.get(key, {})
+        if not isinstance(record, Mapping):
+            raise ValueError(f"{key}: expected a record of the training, got {str(record)[:80]!r}")
+    return record
+
+
 def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
-    """Return the length of a training's windows in microseconds; None unless its events were simulated."""
-    settings = metadata.get("data", {}).get("events_from", {}).get("scenes", {}).get("synthesize")
-    return round(1e6 / settings["frame_rate_hz"]) if settings else None
+    """Return the length of a training's windows in microseconds; None unless its events were simulated.
+
+    ValueError for a frame rate that no simulation has.
+    """
+    rate_hz = nested(metadata, "data", "events_from", "scenes", "synthesize").get("frame_rate_hz")
+    if rate_hz is None:
+        return None
+    if not isinstance(rate_hz, int | float) or not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise ValueError(f"frame_rate_hz: expected {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g}, got {str(rate_hz)[:80]!r}")
+    return round(1e6 / rate_hz)
 
 
 def load_tensors(network: nn.Module, tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> None:

@@ -209,6 +209,8 @@ def _whole(path: Path, name: str, value: Any) -> int | None:
 
 
 def _microseconds(path: Path, t: np.ndarray) -> np.ndarray:
-    if t.dtype.kind == "f" and not (np.equal(t, np.floor(t)).all() and (np.abs(t) < MAX_WHOLE).all()):
-        raise RecordingError(f"{path.name}: expected whole microseconds as times")
+    if t.dtype.kind == "f":
+        exact = np.equal(t, np.floor(t)) & (np.abs(t) < 2.0 ** (np.finfo(t.dtype).nmant + 1))
+        if not exact.all():
+            raise RecordingError(f"{path.name}: expected whole microseconds as times, got {t[~exact][0]} as {t.dtype}")
     return t.astype(np.int64)

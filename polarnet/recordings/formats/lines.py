@@ -32,7 +32,13 @@ MAX_LINE = 2**12  # bytes
 
 COLUMNS = ("t", "x", "y", "p")
 PROPHESEE = ("x", "y", "p", "t")
-NAMES = {"time": "t", "timestamp": "t", "ts": "t", "pol": "p", "polarity": "p", "on": "p"}
+NAMES = {
+    **dict.fromkeys(("time", "times", "timestamp", "timestamps", "ts", "t_us", "ts_us", "timestamp_us"), "t"),
+    **dict.fromkeys(("xs", "col", "column"), "x"),
+    **dict.fromkeys(("ys", "row"), "y"),
+    **dict.fromkeys(("ps", "pol", "polarity", "polarities", "on"), "p"),
+}
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # at the start of text that Windows wrote
 MICROSECONDS = 6  # decimals of a second
 TELLING_TIMES = 4  # different times that tell seconds from microseconds
 MAX_SEARCHED = 2**20  # lines searched for them: a simulated camera's first events may all be at time 0
@@ -79,6 +85,11 @@ def open_text(path: Path, choices: Choices) -> Source:
         raise RecordingError(f"{path.name}: expected lines of the four columns t x y p, got {columns} columns")
     if not all(word.isdigit() for word in size):
         raise RecordingError(f"{path.name}: expected a first line `width height`, got {' '.join(size)!r}")
+    if order is not None and sorted(order) != sorted(COLUMNS):
+        raise RecordingError(
+            f"{path.name}: expected the names t, x, y, p of columns, or such as timestamp, polarity, row, column, got "
+            f"{', '.join(order)}; rename them"
+        )
     width, height = map(int, size) if size else (None, None)
     order = order or COLUMNS
     decimals = [0] * len(order)
@@ -107,15 +118,21 @@ def _layout_of(head: bytes) -> _Layout:
 
 
 def _names(head: bytes) -> tuple[tuple[str, ...] | None, int]:
-    """Column order from a line of names before the numbers, and the next line's offset; None and 0 without one."""
+    """Column order from a line of names before the numbers, and the next line's offset; None and 0 without one.
+
+    Four names before four numbers may be unknown.
+    """
     place = 0
     for line in head.splitlines(keepends=True):
         place += len(line)
-        words = words_of(line.lower().strip(b" #%\r\n\t\xef\xbb\xbf"))
+        words = words_of(line.lower().strip(b" #%\r\n\t\xef\xbb\xbf").replace(b'"', b""))
         order = tuple(NAMES.get(word, word) for word in (one.decode("ascii", "replace") for one in words))
         if sorted(order) == sorted(COLUMNS):
             return order, place
         if words and line.lstrip()[:1] not in (b"#", b"%"):
+            named = len(words) == len(COLUMNS) and not any(map(_NUMBER.fullmatch, words))
+            if named and (first := numbers_of(head[place:])[:1]) and len(first[0].words) == len(COLUMNS):
+                return order, place
             break
     return None, 0
 
@@ -195,6 +212,7 @@ def numbers_of(head: bytes) -> list[Line]:
 
 def words_of(line: bytes) -> list[bytes]:
     """The words between blanks, commas and semicolons, before a comment."""
+    line = line.removeprefix(BYTE_ORDER_MARK)
     return [word for word in _SEPARATORS.split(_COMMENT.split(line, 1)[0]) if word]
 
 

@@ -28,17 +28,29 @@ from polarnet.recordings.source import RecordingError
         ("3.000000 1 2 1\n4.000000 1 2 1\n", [3_000_000, 4_000_000]),
         ("5 1 2 True\n6 1 2 False\n", [5, 6]),
         ("5 1 2 true\n6 1 2 0\n", [5, 6]),
+        ("\ufeff18 12\n5 1 2 1\n6 1 2 0\n", [5, 6]),
     ],
 )  # fmt: skip
 def test_times_with_a_fraction_are_seconds_and_whole_ones_microseconds(tmp_path, read, text, t):
-    (tmp_path / "e.txt").write_text(text, newline="")
+    (tmp_path / "e.txt").write_text(text, newline="", encoding="utf-8")
     _, (times, x, y, p), _ = read(tmp_path / "e.txt", height=12, width=18)
     assert (times, set(x), set(y), p[0]) == (t, {1}, {2}, 1)
 
 
-@pytest.mark.parametrize("names", ["x,y,p,t", "# x y polarity timestamp", "X;Y;on;time\r"])
+@pytest.mark.parametrize(
+    "names",
+    [
+        "x,y,p,t",
+        "# x y polarity timestamp",
+        "X;Y;on;time\r",
+        '"x","y","pol","timestamp"',
+        "xs,ys,polarities,timestamps",
+        "col row p ts_us",
+        "\ufeffx,y,p,t",
+    ],
+)
 def test_a_first_line_of_names_tells_the_order(tmp_path, read, names):
-    (tmp_path / "e.txt").write_text(f"{names}\n1,2,1,0.000005\n3,4,0,0.000006\n")
+    (tmp_path / "e.txt").write_text(f"{names}\n1,2,1,0.000005\n3,4,0,0.000006\n", encoding="utf-8")
     assert read(tmp_path / "e.txt", height=12, width=18)[1:] == ([[5, 6], [1, 3], [2, 4], [1, -1]], {})
 
 
@@ -58,6 +70,8 @@ def test_text_in_a_gzip_or_zip_archive_is_read_and_a_cut_gzip_up_to_the_cut(tmp_
     (tmp_path / "e.txt.gz").write_bytes(packed)
     with zipfile.ZipFile(tmp_path / "e.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("events.txt", content)
+        archive.writestr("__MACOSX/._events.txt", "of macOS")
+        archive.writestr(".DS_Store", "of macOS")
     assert read(tmp_path / "e.txt.gz") == read(tmp_path / "e.zip") == expected
     (tmp_path / "e.txt.gz").write_bytes(packed[: len(packed) // 2])
     _, (t, *_), repairs = read(tmp_path / "e.txt.gz")
@@ -110,8 +124,12 @@ def test_lines_that_are_no_events_are_left_out_and_counted(tmp_path, read, text,
         ("0 12\n1 2 3 1\n", "expected a sensor with sides of 1 to 32767 px, got 12x0"),
         ("18 12\n1 2 3 1 7\n", "expected lines of the four columns t x y p, got 5 columns"),
         ("18 12\n" + "1 20 3 1\n" * 20, "events that are not on the sensor"),
-        ("18 12\n" + "1 2 3 1\n1 ? 3 1\n" * 20, "20 among the first 20 events: lines that are not the numbers"),
+        (
+            "18 12\n" + "1 2 3 1\n1 ? 3 1\n" * 20,
+            r"20 lines that are not the numbers .* \(20 events so far\)",
+        ),
         ("18 12\n" + "1 " * 10_000, "bytes without the end of a line"),
+        ("when,down,right,sign\n1,2,3,1\n", "expected the names t, x, y, p .*, got when, down, right, sign"),
     ],
 )
 def test_text_of_something_else_is_refused_by_name(tmp_path, text, message):
