@@ -3,9 +3,8 @@
 import dataclasses
 import gc
 import importlib
-import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +45,7 @@ def pytest_collection() -> None:
     from hypothesis import settings
 
     yaml.SafeLoader = yaml.CSafeLoader  # with which omegaconf reads params.yaml for every test that loads it
+    os.fsync = lambda handle: None  # no test cuts the power, and each would wait a hundredth of a second
     gc.disable()  # what collection makes lives to the end, and looking through it for garbage takes seconds
     for name, cases in FUZZ_CASES.items():
         settings.register_profile(name, max_examples=cases, deadline=None)
@@ -77,6 +77,7 @@ def pytest_runtest_setup() -> None:
 
     torch.set_num_threads(1)
     torch.set_flush_denormal(False)
+    torch.use_deterministic_algorithms(False)
 
 
 @pytest.fixture(scope="session")
@@ -91,6 +92,20 @@ def shared() -> Path:
     if not folder:
         pytest.skip("POLARNET_SHARED is not set: no reference material to compare with")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def make_events() -> Callable:
+    from event_fixtures import events_of
+
+    return events_of
+
+
+@pytest.fixture(scope="session")
+def make_random_events() -> Callable:
+    from event_fixtures import random_events
+
+    return random_events
 
 
 @pytest.fixture
@@ -186,38 +201,3 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
     frames.finish()
     emulate_scenes(folder / "scenes.zarr", folder / "events.zarr", camera, 3, map, 1)
     return Simulated(folder / "scenes.zarr", folder / "frames.zarr", folder / "events.zarr", camera, 3)
-
-
-@pytest.fixture(scope="session")
-def write_trial() -> Callable[..., None]:
-    """Writes the folder of one job of a sweep of `stages.trial`, in miniature."""
-
-    def write(
-        job: Path,
-        overrides: Sequence[str] = (),
-        seed: int = 1,
-        validation: Mapping[str, float] | None = None,
-        test: Mapping[str, float] | None = None,
-        failure: str | None = None,
-    ) -> None:
-        files = {
-            ".hydra/config.yaml": json.dumps({"seed": seed}),
-            ".hydra/overrides.yaml": json.dumps(list(overrides)),
-        }
-        if validation or test:
-            scores = validation or {"mse": 0.5, "psnr": 3.0}
-            row = {"train_total": 0.5} | {f"val_{name}": value for name, value in scores.items()}
-            files["train/ours/history.csv"] = f"epoch,{','.join(row)}\n0,{','.join(map(str, row.values()))}\n"
-        if test:
-            files["benchmark/metrics.json"] = json.dumps({"simulated": {"ours": test, "zeros": {}}})
-        if failure:
-            files["failure.txt"] = f"{failure}\n"
-        for name, text in files.items():
-            (job / name).parent.mkdir(parents=True, exist_ok=True)
-            (job / name).write_text(text)
-        from polarnet.runtime.files import seal
-
-        if validation or test:
-            seal(job / "train" / "ours")
-
-    return write

@@ -1,15 +1,13 @@
 """Small event streams."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-import pytest
 import torch
 
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.columns import Columns
 
-MakeEvents = Callable[..., Events]
 TYPES = {"t": np.int64, "x": np.int16, "y": np.int16, "p": np.int8}
 
 
@@ -38,18 +36,3 @@ def equal(a: Events, b: Events) -> bool:
 def arrays_of(events: Events) -> Columns:
     """The columns of events as numpy arrays."""
     return Columns(*(getattr(events, name).numpy() for name in TYPES))
-
-
-@pytest.fixture(scope="session")
-def make_events() -> MakeEvents:
-    return events_of
-
-
-@pytest.fixture(scope="session")
-def make_random_events() -> MakeEvents:
-    return random_events
-
-
-@pytest.fixture(scope="session")
-def same_events() -> Callable[[Events, Events], bool]:
-    return equal

@@ -10,7 +10,6 @@ from itertools import zip_longest
 from pathlib import Path
 
 import pytest
-from skimage.data import coffee
 
 ROOT = Path(__file__).resolve().parents[1]
 NOT_LIBRARY = ("cli", "config")
@@ -78,24 +77,5 @@ def test_an_example_prints_what_its_docstring_says(name, tmp_path, monkeypatch):
 
 def test_importing_the_rooms_loads_no_large_package():
     imports = "; ".join(f"import polarnet.{room}" for room in ROOMS)
-    script = f"import sys; {imports}; print([name for name in ('torch', 'numpy', 'zarr', 'av') if name in sys.modules])"
+    script = f"import sys; {imports}; print([name for name in ('torch', 'zarr', 'av', 'hydra') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
-
-
-@pytest.mark.thorough
-def test_simulate_recover_score_and_look_in_a_few_lines():
-    from polarnet.metrics import score
-    from polarnet.networks import shipped_weights
-    from polarnet.recovery import recover
-    from polarnet.reports import plot_prediction
-    from polarnet.simulation import MOTIONS, SENSORS, simulate
-
-    simulation = simulate(coffee().transpose(2, 0, 1) / 255, MOTIONS["default"], SENSORS["default"], seed=1)
-    recovered = recover(simulation.events, shipped_weights(), simulation.t_us)
-    scores = score(recovered.prediction, simulation.dolp[1:], simulation.aolp[1:], warmup_frames=5)
-    assert recovered.t_us.tolist() == simulation.t_us[1:].tolist()
-    assert scores["mse"] < 0.1
-    assert scores["corr"] > 0.3
-    first = recovered.prediction._replace(**{name: values[10] for name, values in recovered.prediction._asdict().items()
-                                             if values is not None})  # fmt: skip
-    assert plot_prediction(first, simulation.dolp[11]).width > 1000

@@ -5,8 +5,7 @@ from method_fixtures import checkpoints, context, make_context, make_sequence, m
 from polarnet.benchmark.sequences import BenchmarkSet
 from polarnet.events.stream import Events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
-from polarnet.storage.events import EventStore
-from polarnet.storage.frames import Contents, FrameStore
+from polarnet.storage import Contents, EventStore, FrameStore
 
 __all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
 

@@ -29,12 +29,10 @@ NAMES = {"randomise": {"model": ["exact", "v2e"], "contrast_threshold_mismatch_o
     ({"sequences_per_picture": 3}, {"leak_rate_hz": 5.0}, {}, "emulate.leak_rate_hz 5.0 (training: 0.01)."),
     ({"speed_min_px_s": 50.0}, {}, {}, None),
     ({"speed_max_px_s": 500.0}, {}, {}, "synthesize.speed_max_px_s 500.0 (training: 160.0)."),
-    ({}, {}, RANGE, None),
     ({}, {"cutoff_hz": 400.0}, RANGE, "emulate.cutoff_hz 400.0 (training: [30.0, 300.0])."),
     ({}, {"contrast_threshold_mismatch_on": 0.15}, NAMES, None),
     ({}, {"model": "esim"}, NAMES, "emulate.contrast_threshold_mismatch_on null (training: [0.1, 0.2]), "
      'emulate.model "esim" (training: ["exact", "v2e"]).'),
-    ({}, RANGE, RANGE, None),
     ({}, RANGE, {}, 'emulate.randomise {"cutoff_hz": [30.0, 300.0]} (training: null).'),
 ])  # fmt: skip
 def test_a_difference_from_the_training_is_said_with_both_values(config, synthesize, emulate, trained, said):

@@ -52,13 +52,10 @@ def test_it_is_a_row_of_the_benchmark_with_its_name_in_tables(activity, with_act
     assert "activity" in [row.label for row in score_table(metrics).rows]
 
 
-def test_it_needs_no_section_in_the_configuration(activity, project_root):
+def test_it_needs_no_section_in_the_configuration_and_recover_runs_it(activity, project_root, sequence, make_setup):
     config = load(project_root, ["benchmark.methods=[oracle_mean,activity]"])
     assert context_of(config, ["activity"], None).setups["activity"].config is None
     assert config.used_baselines == []
-
-
-def test_recover_runs_it(activity, sequence, make_setup):
     channels = sequence.events
     source = Input("test", channels[0].height, channels[0].width, [Piece(channels, 4000, 0.0)])
     frames = list(frames_of(source, WindowRule(1000, None, None), activity.open(make_setup("activity"))))

@@ -40,16 +40,7 @@ def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_sc
         assert one == two
 
 
-def test_a_table_holds_the_rows_it_is_asked_for_whatever_else_lies_in_the_folder(benchmark, tmp_path):
-    folders = written(tmp_path, benchmark)
-    del folders["cf"]
-    left = read_rows(folders, "simulated")
-    assert {score.method for score in left.rows} == {"zeros", "ours"}
-    assert [list(panel.predictions) for panel in left.panels] == [["zeros", "ours"]] * 2
-    assert set(left.costs) == {"zeros", "ours"}
-
-
-def test_a_row_or_set_that_was_not_run_and_rows_of_different_sequences_are_refused(benchmark, tmp_path):
+def test_rows_that_were_not_run_are_refused_and_a_table_holds_those_it_is_asked_for(benchmark, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"row cf was not run; run `dvc repro`"):
         read_record(tmp_path / "cf")
     folders = written(tmp_path, benchmark)
@@ -61,15 +52,18 @@ def test_a_row_or_set_that_was_not_run_and_rows_of_different_sequences_are_refus
     file.write_text(json.dumps(results))
     with pytest.raises(ValueError, match="row cf was scored on other sequences of set simulated than row zeros"):
         read_rows(folders, "simulated")
+    folders = written(tmp_path, benchmark)
+    del folders["cf"]
+    left = read_rows(folders, "simulated")
+    assert {score.method for score in left.rows} == {"zeros", "ours"}
+    assert [list(panel.predictions) for panel in left.panels] == [["zeros", "ours"]] * 2
+    assert set(left.costs) == {"zeros", "ours"}
 
 
-def test_a_row_written_anew_keeps_nothing_of_an_earlier_run(benchmark, tmp_path):
+def test_a_row_written_anew_keeps_nothing_and_the_folder_of_another_or_without_a_seal_is_refused(benchmark, tmp_path):
     write_row(tmp_path / "cf", "cf", RowRecord("cf", None, {}), {"simulated": benchmark, "measured": benchmark})
     written(tmp_path, benchmark, ["cf"])
     assert sorted(path.name for path in (tmp_path / "cf").iterdir()) == ["SHA256SUMS", "row.json", "simulated"]
-
-
-def test_the_folder_of_another_row_and_a_row_without_a_seal_are_refused(benchmark, tmp_path):
     folders = written(tmp_path, benchmark, ["cf", "zeros"])
     shutil.rmtree(folders["cf"])
     shutil.copytree(folders["zeros"], folders["cf"])

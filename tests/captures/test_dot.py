@@ -1,4 +1,4 @@
-"""The paper's rule for start times, and what files a target needs."""
+"""The paper's rule for start times, what files a target needs, and lags between events and pictures."""
 
 from dataclasses import replace
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from polarnet.captures.alignment import agreement, changes, logarithms, spread, steps, thresholds
 from polarnet.captures.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
@@ -83,7 +84,7 @@ def test_a_video_is_an_intensity_capture_with_its_own_times_or_those_beside_it(c
     assert read_intensity_capture(tmp_path / "intensity_0.mp4", config).t_us[-1] == 55_000
 
 
-def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_30(config):
+def test_captures_start_with_the_first_dark_picture_and_the_45th_negative_event(config, make_events):
     assert intensity_start_us("a", pictures([100.0, 30.0, 29.99, 100.0, 5.0]), config) == 20_000
     for region, message in (
         ([100.0, 31.0], r"a: no picture is darker than 30 .* darkest has mean 31\.0; set the start"),
@@ -92,8 +93,6 @@ def test_an_intensity_capture_starts_with_the_first_picture_whose_mean_is_below_
         with pytest.raises(RecordingError, match=message):
             intensity_start_us("a", pictures(region), config)
 
-
-def test_an_event_capture_starts_with_the_45th_negative_event_of_the_region(config, make_events):
     def start_us(x, y, p):
         return event_start_us("a", make_events([(10 * k, x, y, p) for k in range(100)], HEIGHT, WIDTH), config)
 
@@ -144,3 +143,20 @@ def test_starts_by_hand_that_make_no_sense_are_refused(tmp_path, text):
 def test_sizes_that_do_not_fit_into_each_other_are_refused(config, wrong, message):
     with pytest.raises(ValueError, match=message):
         replace(config, **wrong)
+
+
+def test_each_step_lies_between_two_events_of_one_pixel(make_events):
+    rows = [(1, 0, 0, 1), (2, 1, 0, -1), (5, 0, 0, 1), (9, 1, 0, 1), (9, 0, 0, -1)]
+    pairs = steps(make_events(rows, 1, 2), (0, 0), (1, 2), 0, 9)
+    assert pairs.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
+    assert (pairs.after_us.tolist(), pairs.pixel.tolist(), pairs.polarity.tolist()) == ([5], [0], [1])
+
+
+def test_without_change_there_is_no_agreement_and_dark_pixels_do_not_count(make_random_events):
+    pairs = steps(make_random_events(1, 500, 10**6, 4, 5), (0, 0), (4, 5), 0, 10**6)
+    t_us, light = np.arange(0, 1_000_000, 16_667), np.full((60, 4, 5), 2000, np.uint16)
+    change = changes(pairs, 0, t_us, logarithms(light))
+    assert agreement(pairs.polarity, change) == spread(pairs.polarity, change) == 0
+    assert np.isnan(thresholds(pairs.polarity[:0], change[:0]).on)
+    assert np.isnan(changes(pairs, 0, t_us, logarithms(np.full_like(light, 63)))).all()
+    assert np.isnan(changes(pairs, 2_000_000, t_us, logarithms(light))).all()

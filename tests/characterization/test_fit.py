@@ -45,7 +45,7 @@ def fit(static, flickers):
     return fit_sensor(static, 200.0, flickers, SENSORS["default"])
 
 
-def test_a_static_and_two_flicker_recordings_give_the_sensor(fit):
+def test_a_static_and_two_flicker_recordings_give_the_sensor_and_its_hot_pixels(fit, static):
     tolerances = {
         "contrast_threshold_on": 0.03, "contrast_threshold_off": 0.03, "contrast_threshold_sigma_on": 0.12,
         "contrast_threshold_sigma_off": 0.12, "contrast_threshold_correlation": 0.24, "cutoff_hz": 0.1,
@@ -53,6 +53,10 @@ def test_a_static_and_two_flicker_recordings_give_the_sensor(fit):
     }  # fmt: skip
     for name, tolerance in tolerances.items():
         assert fit.estimates[name].value == pytest.approx(getattr(TRUTH, name), rel=tolerance), name
+    hot = int((event_counts(static) > 0.5 * 60 * 120).sum())  # 7200 events each; the others have about 130
+    assert hot == pytest.approx(0.02 * HEIGHT * WIDTH, abs=12)
+    assert fit.estimates["hot_pixel_share"].value == pytest.approx(hot / (HEIGHT * WIDTH))
+    assert fit.estimates["hot_pixel_rate_hz"].value == pytest.approx(60.0, rel=0.02)
 
 
 def test_what_the_recordings_do_not_show_is_missing_and_keeps_the_default(static, flickers):
@@ -65,16 +69,12 @@ def test_what_the_recordings_do_not_show_is_missing_and_keeps_the_default(static
     assert fit.missing["shot_noise_rate_hz"] == "needs a static recording"
 
 
-def test_a_flicker_given_as_the_static_recording_is_noted(fit, flickers):
+def test_a_flicker_given_as_static_is_noted_and_another_sensor_refused(fit, flickers, static):
     assert not any("constant" in note for note in fit.notes)
     assert "was not constant" in fit_sensor(flickers[0].events, 200.0, [], SENSORS["default"]).notes[0]
-
-
-def test_hot_pixels_are_counted_and_their_rate_is_their_mean(fit, static):
-    hot = int((event_counts(static) > 0.5 * 60 * 120).sum())  # 7200 events each; the others have about 130
-    assert hot == pytest.approx(0.02 * HEIGHT * WIDTH, abs=12)
-    assert fit.estimates["hot_pixel_share"].value == pytest.approx(hot / (HEIGHT * WIDTH))
-    assert fit.estimates["hot_pixel_rate_hz"].value == pytest.approx(60.0, rel=0.02)
+    other = emulated(*frames_of(200.0, 0, 2e6, 8, 8), TRUTH, 3)
+    with pytest.raises(ValueError, match="one sensor"):
+        fit_sensor(other, 200.0, flickers, SENSORS["default"])
 
 
 def test_the_twin_of_a_simulated_recording_is_like_it(fit, static, flickers):
@@ -91,22 +91,13 @@ def test_the_twin_of_a_simulated_recording_is_like_it(fit, static, flickers):
         compare(slice_count(static, 0, 1), 200.0, sensor, seed=1)
 
 
-def test_the_refractory_period_is_where_intervals_pile_up():
+def test_the_refractory_period_is_where_intervals_pile_up_or_shot_noise_pauses():
     free = np.random.default_rng(1).uniform(5e3, 1e5, 1000).round()
     assert piled_up_us([np.append(free, np.full(200, 500.0))]).value == 500
     assert piled_up_us([free]) is None
     assert piled_up_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None  # at ticks of the clock
-
-
-def test_shot_noise_shows_the_refractory_period_in_which_it_pauses():
-    """A million intervals at 2 Hz: two a microsecond, so the fifth shortest is about 2.5 us above 500 us."""
+    # A million intervals at 2 Hz: two a microsecond, so the fifth shortest is about 2.5 us above 500 us.
     intervals_us = np.random.default_rng(1).exponential(5e5, 1_000_000)
     assert between_shot_noise_us((500 + intervals_us).round()).value == pytest.approx(500, abs=4)
     assert between_shot_noise_us(intervals_us.round()) is None
     assert between_shot_noise_us((500 + intervals_us[:2000]).round()) is None
-
-
-def test_recordings_of_two_sensors_are_refused(static, flickers):
-    other = emulated(*frames_of(200.0, 0, 2e6, 8, 8), TRUTH, 3)
-    with pytest.raises(ValueError, match="one sensor"):
-        fit_sensor(other, 200.0, flickers, SENSORS["default"])

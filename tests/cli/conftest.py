@@ -1,3 +1,3 @@
-from event_fixtures import make_events, make_random_events
+from method_fixtures import checkpoints
 
-__all__ = ["make_events", "make_random_events"]
+__all__ = ["checkpoints"]

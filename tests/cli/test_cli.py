@@ -62,10 +62,14 @@ def test_verify_of_a_folder_and_of_a_url_names_file_and_sequence_of_a_flipped_or
         bucket.rm("/bucket", recursive=True)
 
 
-def test_verify_of_something_else_says_what_was_expected(tmp_path, capsys):
+def test_verify_of_something_else_says_what_was_expected_and_a_name_that_is_not_utf_8_is_refused(tmp_path, capsys):
     (tmp_path / "nothing.zarr").mkdir()
     assert main(["verify", str(tmp_path / "nothing.zarr")]) == 1
     assert "there is no Zarr v3 group" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as ending:
+        main(["recover", "camera\udcff.raw"])
+    assert ending.value.code == 2
+    assert "'camera\\udcff.raw': expected a name in UTF-8; rename the file" in capsys.readouterr().err
 
 
 MISSING = [
@@ -121,13 +125,6 @@ def test_a_mistyped_method_setting_or_preset_is_refused_with_the_closest_one(lin
     with contextlib.chdir(project_root):
         assert main(line.split()) == 1
     assert f"did you mean {close!r}?" in capsys.readouterr().err
-
-
-def test_a_name_that_is_not_utf_8_is_refused_before_any_work(capsys):
-    with pytest.raises(SystemExit) as ending:
-        main(["recover", "camera\udcff.raw"])
-    assert ending.value.code == 2
-    assert "'camera\\udcff.raw': expected a name in UTF-8; rename the file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [["preset", "smoke"], ["benchmark", "--event-budget"]])

@@ -69,9 +69,7 @@ finally:
 
 
 @pytest.mark.parametrize(("seconds", "unwound"), [(1.0, True), (60.0, False)])
-def test_a_second_interrupt_is_ignored_while_the_first_unwinds_and_ends_what_hangs(
-    tmp_path, project_root, seconds, unwound
-):
+def test_a_second_interrupt_ends_only_what_hangs_after_the_first(tmp_path, project_root, seconds, unwound):
     started, ending = tmp_path / "started", tmp_path / "ending"
     command = [sys.executable, "-c", UNWINDING, str(started), str(ending), str(seconds)]
     with subprocess.Popen(command, cwd=project_root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -18,9 +18,7 @@ def project(tmp_path):
     return tmp_path / "lake"
 
 
-def test_the_stages_depend_on_the_version_instead_of_the_code_and_presets_work(
-    project, project_root, monkeypatch, capsys
-):
+def test_stages_depend_on_the_version_instead_of_code_and_presets_work(project, project_root, monkeypatch, capsys):
     yaml = YAML(typ="safe")
     own, clone = (yaml.load(root / "dvc.yaml")["stages"] for root in (project, project_root))
     assert list(own) == list(clone)

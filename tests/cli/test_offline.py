@@ -38,9 +38,7 @@ def apart():
     return APART
 
 
-def test_simulation_recovery_with_the_shipped_weights_and_stages_succeed_without_a_network(
-    apart, project_root, tmp_path
-):
+def test_simulation_recovery_and_stages_need_no_network(apart, project_root, tmp_path):
     paths = [str(project_root), str(project_root / "tests"), *sys.path]
     words = [json.dumps(paths), json.dumps([*SIZE, *REST])]
     done = subprocess.run([*apart, sys.executable, "-c", WORK, *words], cwd=tmp_path, capture_output=True, text=True)

@@ -8,16 +8,13 @@ import zarr
 from polarnet.cli import main
 
 
-def test_inspect_names_sequences_with_events_and_splits(simulated, capsys):
+def test_inspect_names_sequences_and_video_shows_each_true_frame_after_the_first(simulated, capsys, tmp_path):
     assert main(["inspect", str(simulated.events)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["a-0", "b-0", "c-0", "d-0"]
     assert all("0.200 s" in line and line.endswith(" events") for line in lines)
     assert main(["inspect", str(simulated.frames)]) == 0
     assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["train", "train", "train", "val"]
-
-
-def test_video_shows_a_picture_for_each_true_frame_after_the_first(simulated, tmp_path, capsys):
     assert main(["video", str(simulated.events), "b-0", "--out", str(tmp_path / "b.mp4")]) == 0
     with av.open(str(tmp_path / "b.mp4")) as file:
         assert len([*file.decode(video=0)]) == len(zarr_times(simulated)) - 1

@@ -18,15 +18,7 @@ from polarnet.events.stream import Events
 from polarnet.pictures.images import fit, read_rgb
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.recordings.recording import read_recording
-from polarnet.simulation import (
-    MOTIONS,
-    POLARIZERS,
-    SENSORS,
-    Camera,
-    scene_from_intensities,
-    scene_from_light,
-    simulate,
-)
+from polarnet.simulation import MOTIONS, POLARIZERS, SENSORS, Camera, scene_from_intensities, scene_from_light, simulate
 from polarnet.simulation.camera import PERFECT
 from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
@@ -351,22 +343,3 @@ def test_demo_recovers_a_photograph_better_than_its_mean(tmp_path, capsys):
     error = np.square(dolp[5:] - truth[6:]).mean(axis=(1, 2))
     assert len(dolp) == len(truth) - 1
     assert error.mean() < truth[6:].var(axis=(1, 2)).mean()
-
-
-def test_demo_passes_a_refusal_on(tmp_path, capsys):
-    assert main(["demo", "--out", str(tmp_path / "demo"), "emulate.model=wrong"]) == 1
-    assert "emulate.model" in capsys.readouterr().err
-    assert not (tmp_path / "demo" / "recovered").exists()
-
-
-def test_recover_reads_the_store_and_its_files(capsys):
-    write_video("walk.mp4", np.concatenate([scenery(3, 32, 48), scenery(3, 32, 48)[::-1]]))
-    assert main(["simulate", "walk.mp4", "--out", "out", "--to", "store", "evt3", "--no-preview"]) == 0
-    raw = [f"out/polarizer_{angle:03d}.raw" for angle in POLARIZER_ANGLES_DEG]
-    wanted = ["--method", "highpass", "--write", "zarr", "--out"]
-    assert main(["recover", "out/events.zarr", *wanted, "a"]) == 0
-    assert main(["recover", *raw, "--angles", "0", "45", "90", "135", *wanted, "b"]) == 0
-    for name in "ab":
-        assert zarr.open_group(f"{name}/recovered.zarr", mode="r")["dolp"].shape[1:] == (32, 48)
-    counts = ", ".join(f"{len(e):,} at {angle}" for e, angle in zip(stored(), POLARIZER_ANGLES_DEG, strict=True))
-    assert capsys.readouterr().out.count(counts) == 3

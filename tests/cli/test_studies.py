@@ -1,22 +1,14 @@
 """The event budget as its command runs it, on the small simulated sequences."""
 
 import json
-from dataclasses import asdict
 
 import matplotlib.image
 import pytest
-import torch
 from test_simulate import SMALL
 
 from polarnet.cli import studies
 from polarnet.config.tree import load
-from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 from polarnet.storage.frames import Contents, FrameStore
-
-NETWORK = DolpUNetConfig(
-    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[2, 2], residual_blocks=1, input_mixing="contrasts"
-)
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +32,9 @@ def config(project_root, simulated, tmp_path_factory):
     return load(project_root, [*SMALL, *own])
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    """A small network that nobody trained."""
-    path = tmp_path_factory.mktemp("weights") / "network.safetensors"
-    torch.manual_seed(0)
-    metadata = {"network": "paper", "config": asdict(NETWORK), "in_channels": 4, "representation": "event_tensor"}
-    save_checkpoint(path, DolpUNet(NETWORK).state_dict(), metadata)
-    return path
-
-
 @pytest.mark.thorough
-def test_the_event_budget_asks_its_questions_on_the_test_sequences_alone(config, weights, tmp_path):
-    results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, weights)
+def test_the_event_budget_asks_its_questions_on_the_test_sequences_alone(config, checkpoints, tmp_path):
+    results = studies.run_event_budget(config, tmp_path / "out", ["oracle_mean", "ours"], None, checkpoints["paper"])
     assert results["sequences"] == ["d-0"]
     assert {path.name for path in (tmp_path / "out").glob("figure_11*")} == {
         f"figure_11{part}_simulated.{kind}" for part in "ab" for kind in ("png", "pdf")
@@ -61,11 +43,3 @@ def test_the_event_budget_asks_its_questions_on_the_test_sequences_alone(config,
     assert [entry["window_us"] for entry in results["window_length"]["ours"]] == list(studies.WINDOW_LENGTHS_US)
     assert json.loads((tmp_path / "out" / "event_budget.json").read_text()) == results
     assert matplotlib.image.imread(tmp_path / "out" / "event_budget.png").std() > 0
-
-
-def test_the_event_budget_needs_the_network_and_methods_that_exist(config, tmp_path):
-    with pytest.raises(ValueError, match=r"the event budget needs the DoLP network: .*; give --weights FILE"):
-        studies.run_event_budget(config, tmp_path, ["zeros"], None, tmp_path / "none.safetensors")
-    for methods, got in ((["zeros", "magic"], "magic"), ([], "none")):
-        with pytest.raises(ValueError, match=f"--methods: expected some of zeros, .*, got {got}"):
-            studies.run_event_budget(config, tmp_path, methods, None, None)

@@ -1,10 +1,14 @@
-"""Values that an artefact was made with, compared with those of the run that reads it."""
+"""Values that an artefact was made with, the rows of the benchmark, and the files that they read."""
 
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from polarnet.benchmark.run import Benchmark
+from polarnet.benchmark.score import Cost
+from polarnet.config import pipeline, tables
 from polarnet.config.origins import ORIGIN, Run, digest, read_origin
 from polarnet.config.tree import Config, load
 
@@ -69,30 +73,24 @@ def test_no_value_of_the_simulation_is_ignored_by_a_training(run, override, key)
         run("train", override).check_inputs()
 
 
-def test_a_row_refuses_a_network_that_was_trained_with_other_values(run):
+def test_a_row_refuses_a_network_of_other_values_and_files_of_a_user_have_no_origin(run, tmp_path):
     make_all(run, *SIMULATION, "train")
     run("row", "row=ours", "methods.ours.binning=2").check_inputs()
     run("row", "row=cf", "loss.mse=3.0").check_inputs()  # does not read the network
     with pytest.raises(ValueError, match=r"^loss.mse: .*ours was made with 10.0, this run has 3.0; .*dvc repro train"):
         run("row", "row=ours", "loss.mse=3.0").check_inputs()
-
-
-def test_files_of_a_user_have_no_origin_and_are_accepted(run, tmp_path):
     make_all(run, *SIMULATION)
     row = run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}")
     row.check_inputs()
     assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr", "data/weights"]
 
 
-def test_an_artefact_is_stale_if_it_is_missing_or_of_other_values(run):
+def test_an_origin_holds_the_values_of_an_artefact_and_its_inputs_and_others_are_stale(run, tmp_path):
     emulate = run("emulate").pipeline["emulate"]
     assert run("emulate").is_stale(emulate)
     make_all(run, *SIMULATION)
     assert not run("train", "loss.mse=2.0").is_stale(emulate)
     assert run("train", "emulate.cutoff_hz=30.0").is_stale(emulate)
-
-
-def test_the_origin_of_an_artefact_holds_its_own_values_and_those_of_its_inputs(run, tmp_path):
     make_all(run, *SIMULATION)
     origin = read_origin(tmp_path / "data" / "events.zarr")
     assert {"ingest", "synthesize", "emulate", "polarizers", "readout", "seed"} <= set(origin.values)
@@ -136,3 +134,61 @@ def test_a_digest_changes_with_a_header_a_name_and_a_size(tmp_path):
     second = digest([tmp_path])
     (tmp_path / "b").touch()
     assert len({first, second, digest([tmp_path])}) == 3
+
+
+def scored_rows(rows):
+    return Benchmark([], dict.fromkeys(rows, Cost(0.0, None, 0)), [])
+
+
+@pytest.mark.parametrize(("enabled", "scored"), [("false", ["simulated"]), ("true", ["simulated", "recordings"])])
+def test_real_targets_are_a_set_while_they_are_switched_on(project_root, tmp_path, monkeypatch, enabled, scored):
+    opened, written = [], {}
+    monkeypatch.setattr(pipeline, "pipeline_set", lambda config, name, rows: opened.append(name))
+    monkeypatch.setattr(
+        pipeline, "run_benchmark", lambda test_set, context, settings, *_: scored_rows(settings.methods)
+    )
+    monkeypatch.setattr(pipeline, "lpips_of", lambda config: None)
+    monkeypatch.setattr(pipeline, "write_row", lambda folder, row, record, sets: written.update({row: list(sets)}))
+    config = load(project_root, [f"paths.data={tmp_path}", f"recordings.enabled={enabled}"])
+    pipeline.run_rows(config, ["zeros", "cf", "rotating_polarizer"])
+    assert opened == scored
+    assert written == {"zeros": scored, "cf": scored, "rotating_polarizer": ["simulated"]}  # targets: four channels
+    assert pipeline.set_folder(config, "simulated") == tmp_path / "benchmark" / "sets" / "simulated"
+    assert pipeline.set_folder(config, "recordings") == tmp_path / "benchmark" / "sets" / "recordings"
+
+
+def test_a_row_without_weights_is_recorded_without_opening_a_test_set(project_root, tmp_path):
+    config = load(project_root, [f"paths.data={tmp_path}"])
+    pipeline.run_rows(config, ["e2p"])
+    row = tmp_path / "benchmark" / "rows" / "e2p"
+    assert {file.name for file in row.iterdir()} == {"row.json", "SHA256SUMS"}
+    assert "no weights are given: add the row to section `rows`" in (row / "row.json").read_text()
+    with pytest.raises(ValueError, match="expected at least one row that can run, got none"):
+        tables.collect_rows(load(project_root, [f"paths.data={tmp_path}", "benchmark.methods=[e2p]"]))
+
+
+def test_a_baseline_is_trained_for_a_row_that_needs_it_and_a_row_takes_the_weights_of_its_entry(project_root, tmp_path):
+    assert load(project_root).used_baselines == ["e2v"]
+    assert load(project_root, ["rows.e2v.needs=data/external/mine.safetensors"]).used_baselines == []
+    assert load(project_root, ["benchmark.methods=[cf,ours]"]).used_baselines == []
+    unused = r"no row of benchmark.methods uses the weights of baselines.e2p.*data/train/e2p"
+    with pytest.raises(ValueError, match=unused):
+        load(project_root, ["baseline=e2p"])
+    config = load(project_root, [f"paths.train={tmp_path}", "rows.e2v.needs=data/external/mine.safetensors"])
+    assert config.weights_of("ours") == tmp_path / "ours" / "best.safetensors"
+    assert config.weights_of("e2v") == Path("data/external/mine.safetensors")
+    assert config.weights_of("e2p") is None
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("rows.highpass.settings=methods.cf", "rows.highpass.settings: expected methods.highpass, which the row reads"),
+        ("~rows.cf.needs", "rows.cf.needs: expected a value, got none; add the key"),
+        ("baselines.trained=[]", "rows.e2v.needs: no stage makes data/train/e2v; add e2v to baselines.trained"),
+        ("train.start=outputs/a.safetensors", "train.start: expected a file below data/external/start, whose content"),
+    ],
+)
+def test_a_value_whose_file_or_section_dvc_would_not_follow_is_refused(project_root, change, expected):
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        load(project_root, [change])

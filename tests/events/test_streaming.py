@@ -1,5 +1,7 @@
 import itertools
+import math
 
+import numpy as np
 import pytest
 import torch
 from event_fixtures import events_of, random_events
@@ -7,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polarnet.events.representations import event_tensor, voxel_grid_of_window
+from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import WindowCutter, WindowRule, cut_windows, encode_windows, parse_window
 
@@ -40,20 +43,10 @@ def test_windows_do_not_depend_on_the_pieces_in_which_a_stream_comes(rule, piece
             assert torch.equal(ours.x, slice_time(all_of_them, a.start_us, a.stop_us).x)
 
 
-def test_consecutive_windows_of_a_time_hold_every_event_once():
-    cut = windows(WindowRule(4000, None, None))
-    assert [(w.start_us, w.stop_us) for w in cut] == [(0, 4000), (4000, 8000), (8000, 12000), (12000, 16000),
-                                                        (16000, 20000)]  # fmt: skip
-    assert sum(len(events) for w in cut for events in w.channels) == 4 * 300
-
-
-def test_overlapping_windows_are_whole_ones_that_end_at_every_step():
+def test_overlapping_windows_end_at_every_step_and_windows_of_a_number_follow_each_other_and_hold_it():
     cut = windows(WindowRule(5000, None, 100))
     assert [w.stop_us for w in cut] == list(range(5000, 20001, 100))
     assert {w.stop_us - w.start_us for w in cut} == {5000}
-
-
-def test_windows_of_a_number_follow_each_other_and_hold_it():
     cut = windows(WindowRule(None, 90, None))
     assert all(90 <= sum(map(len, w.channels)) < 95 for w in cut)  # events of one time stay together
     assert all(after.start_us == before.stop_us for before, after in itertools.pairwise(cut))
@@ -103,15 +96,6 @@ def test_a_time_stamp_far_in_the_future_is_refused_and_a_long_recording_is_not()
         cutter.add([event([10**13])], 10**13 + 1)
 
 
-def test_the_last_two_events_before_each_step_make_a_window():
-    """Events at 10, 20, 120, 130 and 250 us, a step of 100 us; the window starts with the first of the two."""
-    channel = events_of([(t, 0, 0, 1) for t in (10, 20, 120, 130, 250)], 1, 1)
-    cut = list(WindowCutter(WindowRule(None, 2, 100), 1, 1, channels=1).add([channel], 300))
-    assert [(w.start_us, w.stop_us, w.channels[0].t.tolist()) for w in cut] == [
-        (10, 100, [10, 20]), (120, 200, [120, 130]), (130, 300, [130, 250]),
-    ]  # fmt: skip
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 100), max_size=40), st.sets(st.integers(0, 100), min_size=2, max_size=6))
 def test_windows_share_out_all_events_from_the_first_frame_to_before_the_last(times, edges):
@@ -121,15 +105,31 @@ def test_windows_share_out_all_events_from_the_first_frame_to_before_the_last(ti
     assert torch.cat([part.t for part in parts]).tolist() == inside.t.tolist()
 
 
-def test_several_images_of_a_representation_stay_together_polarizer_by_polarizer():
+def test_images_of_a_representation_stay_together_and_frame_times_must_increase():
     t_us = torch.tensor([0, 6_000, 13_000])
     inputs = encode_windows(CHANNELS, t_us, voxel_grid_of_window)
     assert inputs.shape == (2, 20, HEIGHT, WIDTH)
     assert torch.equal(inputs[1, 5:10], voxel_grid_of_window(slice_time(CHANNELS[1], 6_000, 13_000), 7_000))
-
-
-def test_two_frame_times_a_microsecond_apart_make_one_window_and_equal_ones_none():
     assert encode_windows([Events.empty(2, 3)], torch.tensor([5, 6]), event_tensor).shape == (1, 1, 2, 3)
     for times in ([5, 5], [5, 6, 6], [5]):
         with pytest.raises(ValueError, match="at least two frame times, each later than the last"):
             encode_windows([Events.empty(2, 3)], torch.tensor(times), event_tensor)
+
+
+def test_a_steady_polarizer_turns_evenly_and_triggers_follow_an_uneven_rotation():
+    rotation, back = steady_rotation(2.0, math.radians(20)), steady_rotation(-1.0)
+    assert np.degrees(rotation.at(np.array([0, 125_000, 1_125_000]))) == pytest.approx([20, 110, 830])
+    assert np.degrees(back.at(np.array([250_000]))) == pytest.approx([-90])
+    assert (rotation.half_turn_us, back.rate_hz, back.half_turn_us) == (250_000, -1.0, 500_000)
+    rotation = triggered_rotation(np.array([1000, 2000, 4000]), math.radians(10))
+    assert np.degrees(rotation.at(np.array([1000, 1500, 3000, 6000]))) == pytest.approx([10, 190, 550, 1090])
+    assert np.degrees(rotation.since(1000).at(np.array([500]))) == pytest.approx([190])
+
+
+def test_a_polarizer_at_rest_and_a_single_trigger_are_refused():
+    with pytest.raises(ValueError, match="a rate in turns per second other than 0"):
+        steady_rotation(0.0)
+    with pytest.raises(ValueError, match="at least two trigger times, got 1"):
+        triggered_rotation(np.array([5]))
+    with pytest.raises(ValueError, match="expected increasing times"):
+        Rotation(np.array([1.0, 1.0]), np.array([0.0, 1.0]))

@@ -5,7 +5,7 @@ from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule, join_windows
 from polarnet.methods import METHODS
 from polarnet.methods.method import Recoverer
-from polarnet.methods.overlap import advance, begin, of_any_length, warm_up
+from polarnet.methods.overlap import advance, begin, of_any_length
 from polarnet.stokes import Prediction
 
 WINDOW_US = 1000
@@ -22,10 +22,18 @@ def ours(make_setup):
     return METHODS["ours"].open(make_setup("ours"))
 
 
-def test_windows_at_once_must_follow_each_other(sequence, ours):
+def test_windows_at_once_must_follow_each_other_and_joined_ones_hold_each_event_once(sequence, ours):
     windows = sequence.windows
     with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
         advance(ours, begin(ours, 18, 20), [windows[0], windows[2]])
+    overlapping = windows_of(sequence, WindowRule(WINDOW_US, None, 500))
+    joined = join_windows(overlapping)
+    assert (joined.start_us, joined.stop_us, joined.joined) == (0, overlapping[-1].stop_us, len(overlapping))
+    for channel, events in zip(joined.channels, sequence.events, strict=True):
+        assert torch.equal(channel.t, slice_time(events, 0, joined.stop_us).t)
+    any_length = of_any_length(ours, TRAINED_US)
+    _, one_step = ours.step(ours.start(18, 20), [joined])
+    torch.testing.assert_close(any_length.step(any_length.start(18, 20), [joined])[1].dolp, one_step.dolp)
 
 
 def test_overlapping_windows_continue_those_that_ended_where_they_begin(sequence, ours):
@@ -71,15 +79,6 @@ def test_a_bounded_number_of_states_is_kept_however_fine_the_steps():
         if begun[-1] is not None:
             assert 0 <= stop - length - begun[-1] < length / 64 + 100
     assert len(history) <= 67
-
-
-@pytest.mark.parametrize("name", ["cf", "ours"])
-def test_a_warm_up_leaves_no_trace(name, sequence, make_setup):
-    recoverer = METHODS[name].open(make_setup(name))
-    _, before = advance(recoverer, begin(recoverer, 18, 20), sequence.windows)
-    warm_up(recoverer, 18, 20)
-    _, after = advance(recoverer, begin(recoverer, 18, 20), sequence.windows)
-    assert torch.equal(before.dolp, after.dolp)
 
 
 TRAINED_US = 1000
@@ -128,14 +127,3 @@ def test_every_event_counts_once_in_the_series_that_ends_with_a_window_and_windo
     torch.testing.assert_close(torch.cat(frames), together.dolp)
     _, whole = ours.step(ours.start(18, 20), sequence.windows)
     torch.testing.assert_close(together.dolp[3::4], whole.dolp, atol=1e-4, rtol=1e-4)
-
-
-def test_windows_joined_for_want_of_time_stay_whole_and_hold_each_event_once(sequence, ours):
-    overlapping = windows_of(sequence, WindowRule(WINDOW_US, None, 500))
-    joined = join_windows(overlapping)
-    assert (joined.start_us, joined.stop_us, joined.joined) == (0, overlapping[-1].stop_us, len(overlapping))
-    for channel, events in zip(joined.channels, sequence.events, strict=True):
-        assert torch.equal(channel.t, slice_time(events, 0, joined.stop_us).t)
-    any_length = of_any_length(ours, TRAINED_US)
-    _, one_step = ours.step(ours.start(18, 20), [joined])
-    torch.testing.assert_close(any_length.step(any_length.start(18, 20), [joined])[1].dolp, one_step.dolp)

@@ -5,18 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rotation_fixtures import angle_error_deg, exact_events
 
 from polarnet.config.tree import load
 from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow
-from polarnet.methods.rotating_polarizer import (
-    RotatingPolarizerConfig,
-    fit_half_turn,
-    local_variance,
-    open_rotating,
-)
+from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig, fit_half_turn, local_variance, open_rotating
 from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import Sine, Trajectory
 from polarnet.simulation.rotating import emulate_rotating
@@ -30,6 +24,28 @@ IDEAL = RotatingPolarizerConfig(
 """For events exactly at the thresholds of the logarithm."""
 DOLP = np.array([[0.25, 0.4, 0.6], [0.8, 0.9, 0.5]])
 AOLP = np.array([[0.0, 0.3, 1.0], [1.6, 2.4, 3.1]])
+
+
+def exact_events(dolp, aolp, rotation, stop_us, threshold=0.2, delay_us=0.0):
+    """Events at the crossings of ln(1 + DoLP cos 2 (angle - AoLP)), found on a grid of 5 us and between its points."""
+    t_us = np.arange(0, stop_us + 5, 5.0)
+    rows = []
+    for (y, x), m in np.ndenumerate(dolp):
+        logs = np.log1p(m * np.cos(2 * (rotation.at(t_us - delay_us) - aolp[y, x])))
+        # a level of the staircase is crossed again by the opposite polarity only one threshold further on
+        reference = logs[0]
+        for k in range(1, len(t_us)):
+            while abs(logs[k] - reference) >= threshold:
+                p = 1 if logs[k] > reference else -1
+                reference += p * threshold
+                share = (reference - logs[k - 1]) / (logs[k] - logs[k - 1])
+                rows.append((round(t_us[k - 1] + 5 * share), x, y, p))
+    columns = np.array(sorted(rows), np.int64).reshape(-1, 4).T
+    return Events.from_columns(*columns, *dolp.shape)
+
+
+def angle_error_deg(found, truth):
+    return np.degrees((found.numpy() - truth + math.pi / 2) % math.pi - math.pi / 2)
 
 
 @pytest.mark.parametrize("rate_hz", [4.0, -4.0])

@@ -7,7 +7,7 @@ from skimage.filters import sobel_h, sobel_v
 from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.reliability import BINS, reliability
 from polarnet.metrics.similarity import (
     aolp_error_deg,
     correlation,
@@ -31,15 +31,12 @@ def pair():
     return smooth.clone(), (smooth + 0.2 * torch.rand(2, 24, 31, generator=generator)).clamp(0, 1)
 
 
-def test_an_offset_of_a_tenth_is_20_db_and_all_level():
+def test_an_offset_of_a_tenth_is_20_db_and_all_level_and_equal_frames_have_100_db(pair):
     a, b = torch.full((3, 8, 8), 0.5), torch.full((3, 8, 8), 0.6)
     torch.testing.assert_close(mse(a, b), torch.full((3,), 0.01))
     torch.testing.assert_close(psnr(a, b), torch.full((3,), 20.0))
     torch.testing.assert_close(level_mse(a, b), mse(a, b))
     torch.testing.assert_close(pattern_mse(a, b), torch.zeros(3), atol=1e-12, rtol=0)
-
-
-def test_equal_frames_have_100_db_ssim_1_and_correlation_1_whatever_their_gain_and_offset_but_not_sign(pair):
     a, _ = pair
     assert psnr(a, a).tolist() == [100.0, 100.0]
     torch.testing.assert_close(ssim(a, a), torch.ones(2))
@@ -57,7 +54,7 @@ def test_a_constant_frame_correlates_0_with_anything_and_has_a_gradient(pair, va
     assert constant.grad.isfinite().all()
 
 
-def test_ssim_is_that_of_torchmetrics(pair):
+def test_ssim_is_that_of_torchmetrics_and_has_the_gradient_of_its_finite_differences(pair):
     a, b = (x.double() for x in pair)
     for i in range(2):
         expected = structural_similarity_index_measure(
@@ -65,9 +62,6 @@ def test_ssim_is_that_of_torchmetrics(pair):
         )
         torch.testing.assert_close(ssim(a, b)[i], expected, rtol=1e-7, atol=0)
         assert ssim(*(x.float() for x in (a, b)))[i].item() == pytest.approx(expected.item(), rel=1e-4)
-
-
-def test_ssim_has_the_gradient_of_its_finite_differences_and_keeps_float32_under_autocast(pair):
     a, b = (image[:1, :7, :6].double() for image in pair)
     assert torch.autograd.gradcheck(lambda x: ssim(x, b), a.requires_grad_())
     with torch.autocast("cpu", torch.bfloat16):
@@ -75,7 +69,7 @@ def test_ssim_has_the_gradient_of_its_finite_differences_and_keeps_float32_under
     assert torch.equal(inside, ssim(*pair))
 
 
-def test_mse_psnr_and_correlation_are_those_of_scikit_image_and_numpy(pair):
+def test_mse_psnr_and_correlation_are_those_of_scikit_image_and_numpy_and_level_and_pattern_add_up(pair):
     a, b = (x.double() for x in pair)
     for i in range(2):
         pictures = b[i].numpy(), a[i].numpy()
@@ -83,25 +77,19 @@ def test_mse_psnr_and_correlation_are_those_of_scikit_image_and_numpy(pair):
         assert psnr(a, b)[i].item() == pytest.approx(peak_signal_noise_ratio(*pictures, data_range=1), rel=1e-12)
         expected = np.corrcoef(pictures[0].flatten(), pictures[1].flatten())[0, 1]
         assert correlation(a, b)[i].item() == pytest.approx(expected, rel=1e-6)
-
-
-def test_the_spread_is_the_error_of_the_own_mean_and_level_and_pattern_add_up(pair):
     _, b = pair
     torch.testing.assert_close(spread_mse(b), mse(b.mean(dim=(-2, -1), keepdim=True).expand_as(b), b))
     a, b = (x.double() for x in pair)
     torch.testing.assert_close(level_mse(a, b) + pattern_mse(a, b), mse(a, b), rtol=1e-12, atol=0)
 
 
-def test_gradients_of_equal_ramps_agree_and_half_as_steep_a_one_agrees_less():
+def test_gradients_of_equal_ramps_agree_and_agreement_is_that_of_scikit_images_sobel(pair):
     ramp = torch.linspace(0, 1, 9).expand(7, 9)
     assert gradient_agreement(ramp, ramp + 0.1).item() == pytest.approx(1)
     assert gradient_agreement(ramp, 0.5 * ramp).item() == pytest.approx(2 * 0.5 / (1 + 0.25))
     assert gradient_agreement(ramp, -ramp).item() == pytest.approx(-1)
     assert gradient_agreement(torch.full((7, 9), 1 / 3), ramp).item() == 0
     assert gradient_agreement(ramp, torch.linspace(0, 1, 7)[:, None].expand(7, 9)).item() == pytest.approx(0, abs=1e-7)
-
-
-def test_gradient_agreement_is_that_of_scikit_images_sobel(pair):
     a, b = (x.double() for x in pair)
     # scikit-image's kernels sum to 1 on either side of the centre; ours take the slope per pixel: half as much
     along = [[f(x[0].numpy())[1:-1, 1:-1] for f in (sobel_h, sobel_v)] for x in (a, b)]
@@ -125,24 +113,10 @@ def test_the_angle_between_two_orientations_goes_the_shorter_way_round(a_deg, b_
     assert aolp_error_deg(b, a, torch.ones(1, 2, 2)).item() == pytest.approx(error, abs=1e-9)
 
 
-def test_an_angle_weighs_as_much_as_the_light_is_polarized():
+def test_an_angle_weighs_as_much_as_the_light_is_polarized_and_is_else_right_by_chance():
     error = torch.tensor([[0.0, np.deg2rad(40)]])
     assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.3]])).item() == pytest.approx(10, abs=1e-5)
     assert aolp_error_deg(error, 0 * error, torch.tensor([[0.9, 0.0]])).item() == 0
-
-
-def test_pixels_that_are_not_valid_count_in_no_gradient_angle_or_spread(pair):
-    a, b = pair
-    valid = torch.ones(2, 24, 31, dtype=torch.bool)
-    valid[:, :, 20:] = False
-    spoilt = torch.where(valid, a, 7.0)
-    known, other = a[..., :20], b[..., :20]
-    torch.testing.assert_close(gradient_agreement(spoilt, b, valid), gradient_agreement(known, other))
-    torch.testing.assert_close(aolp_error_deg(spoilt, b, b, valid), aolp_error_deg(known, other, other))
-    torch.testing.assert_close(spread_mse(spoilt, valid), spread_mse(known))
-
-
-def test_without_polarization_an_angle_is_right_by_chance():
     zero = torch.zeros(2, 3, 3)
     assert aolp_error_deg(zero, zero, zero).tolist() == [45.0, 45.0]
     random = torch.rand(1, 300, 300, generator=torch.Generator().manual_seed(0)) * torch.pi
@@ -151,11 +125,16 @@ def test_without_polarization_an_angle_is_right_by_chance():
     )
 
 
-PIXELWISE = [mse, level_mse, pattern_mse, psnr, correlation]
-
-
-def test_masked_ssim_is_the_mean_of_the_map_over_the_valid_pixels(pair):
-    """scikit-image's map, which it makes in its own way; the frames agree where they are masked."""
+def test_masked_scores_are_those_of_the_valid_pixels(pair):
+    a, b = pair
+    valid = torch.ones(2, 24, 31, dtype=torch.bool)
+    valid[:, :, 20:] = False
+    spoilt = torch.where(valid, a, 7.0)
+    known, other = a[..., :20], b[..., :20]
+    torch.testing.assert_close(gradient_agreement(spoilt, b, valid), gradient_agreement(known, other))
+    torch.testing.assert_close(aolp_error_deg(spoilt, b, b, valid), aolp_error_deg(known, other, other))
+    torch.testing.assert_close(spread_mse(spoilt, valid), spread_mse(known))
+    # scikit-image's map, which it makes in its own way; the frames agree where they are masked.
     truth, other = pair
     valid = torch.zeros(24, 31, dtype=torch.bool)
     valid[6:12, 8:20] = True
@@ -164,6 +143,9 @@ def test_masked_ssim_is_the_mean_of_the_map_over_the_valid_pixels(pair):
         options = {"data_range": 1.0, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
         _, whole = structural_similarity(a.numpy(), b.numpy(), full=True, **options)
         assert masked.item() == pytest.approx(float(whole[valid.numpy()].mean()), abs=1e-5)
+
+
+PIXELWISE = [mse, level_mse, pattern_mse, psnr, correlation]
 
 
 @pytest.mark.parametrize("metric", [*PIXELWISE, ssim])
@@ -210,18 +192,6 @@ def test_frames_of_bytes_or_of_different_shapes_are_refused(unchecked_annotation
         metric(a, b, b)
 
 
-def test_lpips_takes_numpy_and_refuses_bytes_and_a_truth_of_another_range(unchecked_annotations):
-    network = Lpips("vgg")
-    a, b = torch.rand(2, 1, 32, 32, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(network(a.numpy(), b.numpy()), network(a, b))
-    with pytest.raises(ValueError, match=r"images: expected floating-point numbers, got torch\.uint8"):
-        network((255 * a).byte(), b)
-    with pytest.raises(
-        ValueError, match=r"truth: expected images in \[0, 1\], got values up to 2\d\d.*; divide by 255"
-    ):
-        network(a, 255 * b)
-
-
 def test_a_slope_below_a_tenth_of_a_stored_step_per_pixel_is_no_edge_on_any_shape_of_frame():
     """A tenth of a step is 1e-6: a ramp of 0.9e-6 a pixel is flat, and one of 1.1e-6 is not."""
     for slope, agreement in ((0.9e-6, 0.0), (1.1e-6, 1.0)):
@@ -235,7 +205,7 @@ OFFSETS = torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
 """Error of DoLP in each frame: squared 0.16, 0.04 and 0.01."""
 
 
-def test_the_mean_covers_the_frames_after_the_warmup():
+def test_the_mean_covers_the_frames_after_the_warmup_and_an_angle_if_the_method_predicts_one():
     prediction = Prediction(DOLP + OFFSETS)
     for warmup, expected in ((0, 0.07), (1, 0.025), (2, 0.01)):
         assert score(prediction, DOLP, DOLP, warmup)["mse"] == pytest.approx(expected, abs=1e-6)
@@ -243,9 +213,40 @@ def test_the_mean_covers_the_frames_after_the_warmup():
     for warmup in (-1, 3):
         with pytest.raises(ValueError, match=f"expected 0 to 2, got {warmup}"):
             score(prediction, DOLP, DOLP, warmup)
-
-
-def test_an_angle_is_scored_if_the_method_predicts_one():
     assert "aolp_deg" not in frame_scores(Prediction(DOLP), DOLP, DOLP)
     turned = Prediction(DOLP, aolp=DOLP + math.radians(10))
     assert frame_scores(turned, DOLP, DOLP)["aolp_deg"].tolist() == pytest.approx([10, 10, 10], abs=1e-4)
+
+
+def test_errors_of_the_predicted_size_lie_on_the_diagonal_and_sequences_add_up():
+    torch.manual_seed(0)
+    log_variance = torch.empty(4, 100, 100).uniform_(-8, -4)
+    truth = torch.full_like(log_variance, 0.5)
+    dolp = truth + torch.randn_like(truth) * (log_variance / 2).exp()
+    result = reliability(log_variance, dolp, truth)
+    for predicted, measured, pixels in result.curve():
+        assert measured == pytest.approx(predicted, rel=0.1)
+        assert pixels > 1000
+    assert result.log_error() < 0.1
+    assert sum(pixels for *_, pixels in result.curve()) == truth.numel()
+    truth, valid = torch.zeros(1, 1, 2), torch.tensor([[[True, False]]])
+    one = reliability(torch.tensor([[[-2.2, -2.2]]]), truth + 0.5, truth, valid)
+    two = reliability(torch.tensor([[[-30.0, 5.0]]]), truth + 0.5, truth)
+    together = one + two
+    assert together.pixels.sum() == 3
+    assert together.pixels[0] == together.pixels[BINS - 1] == 1
+    assert together.measured.sum() == 0.75
+    with pytest.raises(ValueError, match="needs pixels"):
+        reliability(truth, truth, truth, torch.zeros_like(truth, dtype=torch.bool)).log_error()
+
+
+def test_errors_four_times_as_large_as_expected_are_off_by_ln_4_and_a_bin_spans_half_a_unit():
+    log_variance = torch.full((1, 2, 2), math.log(0.01))
+    truth = torch.zeros(1, 2, 2)
+    result = reliability(log_variance, truth + 0.2, truth)
+    assert result.curve() == [pytest.approx((0.01, 0.04, 4))]
+    assert result.log_error() == pytest.approx(math.log(4), rel=1e-5)
+    log_variance = torch.tensor([[[-11.8, -11.3, -6.2, -0.2]]])
+    result = reliability(log_variance, torch.zeros(1, 1, 4), torch.ones(1, 1, 4))
+    assert result.pixels.nonzero().flatten().tolist() == [0, 1, 11, 23]
+    assert len(result.pixels) == 24

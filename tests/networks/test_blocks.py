@@ -43,17 +43,6 @@ def test_levels_over_windows_at_once_are_the_same_as_window_by_window(height, wi
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("levels", "reached"), [(1, False), (3, True)])
-def test_each_level_sees_further(levels, reached):
-    torch.manual_seed(0)
-    level, x = Level(4, [4] * levels), torch.randn(1, 4, 1, 64)
-    changed = x.clone()
-    changed[..., 63] += 10
-    far = (level(x, 1, [])[0] - level(changed, 1, [])[0])[..., :40]
-    assert bool(far.any()) == reached
-
-
-@torch.no_grad()
 def test_a_convolution_on_blocks_is_that_of_the_unshuffled_image():
     torch.manual_seed(0)
     layer, image = conv3x3(4 * 3, 5), torch.randn(2, 3, 8, 10)

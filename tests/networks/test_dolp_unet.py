@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig, compressed, contrasts
+from polarnet.networks.paper.swin import WindowAttention, attend, join_windows, split_windows
 
 PAPER = DolpUNetConfig(
     channels=[32, 64, 128], swin_depth=2, swin_window=5, swin_heads=[2, 4], residual_blocks=2, input_mixing="contrasts"
@@ -35,18 +36,53 @@ def test_the_papers_input_is_the_four_event_tensors_as_they_are():
     torch.testing.assert_close(inputs_of_c1[0], tensors, rtol=0, atol=0)
 
 
-def test_inputs_are_compressed_logarithmically_with_their_sign():
+def test_inputs_are_compressed_contrasts_of_the_channels_bin_by_bin():
     values = torch.tensor([[-(torch.e - 1), 0.0, torch.e - 1]])
     torch.testing.assert_close(compressed(values), torch.tensor([[-1.0, 0.0, 1.0]]))
-
-
-def test_the_channels_are_those_of_the_stokes_parameters_for_each_bin_of_its_own():
     channels = torch.arange(8.0).view(8, 1, 1) ** 2  # two bins of each of the four polarizers
     expected = [(0 + 4 + 16 + 36) / 2, (1 + 9 + 25 + 49) / 2, 0 - 16, 1 - 25, 4 - 36, 9 - 49, 16 - 40, 26 - 58]
     assert contrasts(channels).flatten().tolist() == expected
     assert contrasts(torch.full((4, 1, 1), 3.0)).flatten().tolist() == [6, 0, 0, 0]  # light that is not polarized
-
-
-def test_heads_that_do_not_divide_the_channels_are_refused():
     with pytest.raises(ValueError, match="swin_heads: expected a divisor of 64 channels, got 3"):
         replace(PAPER, swin_heads=[3, 4])
+
+
+def influence(attention: WindowAttention, row: int, column: int, height: int, width: int) -> torch.Tensor:
+    """Which output pixels change when one input pixel does."""
+    torch.manual_seed(1)
+    image = torch.randn(1, height, width, attention.qkv.in_features)
+    changed = image.clone()
+    changed[0, row, column] += 1
+    return (attention(changed) != attention(image)).any(dim=-1)[0]
+
+
+def test_windows_put_back_give_the_image_and_one_beyond_it_what_the_part_inside_would_give():
+    for height, width, window, shift in ((10, 15, 5, 0), (10, 15, 5, 2), (7, 9, 4, 0), (7, 9, 4, 2), (3, 3, 5, 2)):
+        image = torch.randn(2, height, width, 12)
+        windows = split_windows(torch.cat([image, image, image], dim=-1), 3, window, shift)
+        for part in windows:
+            assert torch.equal(join_windows(part, height, width, window, shift), image)
+    torch.manual_seed(0)
+    query, key, value = torch.randn(3, 1, 1, 2, 16, 4).unbind()
+    bias = torch.randn(2, 16, 16)
+    inside = torch.arange(16).view(4, 4)[:3, :2].flatten()
+    visible = torch.zeros(1, 1, 1, 16, dtype=torch.bool)
+    visible[..., inside] = True
+    masked = attend(query, key, value, bias, visible)[..., inside, :]
+    part = [tensor[..., inside, :] for tensor in (query, key, value)]
+    torch.testing.assert_close(masked, attend(*part, bias[:, inside][:, :, inside], None))
+
+
+@pytest.mark.parametrize(
+    ("shift", "pixel", "rows", "columns"),
+    [
+        (0, (5, 2), slice(4, 8), slice(0, 4)),  # its own window
+        (2, (3, 3), slice(2, 6), slice(2, 6)),  # a window that straddles the plain ones
+        (2, (0, 0), slice(0, 2), slice(0, 2)),  # the part of a window inside the image, not the opposite border
+    ],
+)
+def test_a_pixel_is_seen_in_its_window_and_nowhere_else(shift, pixel, rows, columns):
+    expected = torch.zeros(8, 8, dtype=torch.bool)
+    expected[rows, columns] = True
+    attention = WindowAttention(8, 2, window=4, shift=shift)
+    assert torch.equal(influence(attention, *pixel, height=8, width=8), expected)

@@ -35,14 +35,11 @@ def test_candidates_that_agree_say_the_least_and_the_others_how_far_they_are_apa
     assert of_frame.unique().item() == pytest.approx((disagree + agree) / 2)
 
 
-def test_a_candidate_that_the_network_does_not_trust_does_not_count():
+def test_candidates_count_if_trusted_and_frames_without_evidence_are_told_apart():
     candidates, weights = EVEN.clone(), EVEN.clone()
     candidates[:, 0], weights[:, 0] = 0.9, 0.0
     torch.testing.assert_close(features(candidates, weights), features())
     assert features(candidates, 0 * weights).isfinite().all()
-
-
-def test_frames_without_evidence_are_told_apart_and_errors_of_middle_values_have_most_room():
     silence = [features(evidence=share * EVEN)[0, 2].unique().item() for share in (100, 0.2, 0)]
     assert silence == pytest.approx([0, 0.5, 1], abs=0.01)
     evidence = 0 * EVEN
@@ -52,16 +49,13 @@ def test_frames_without_evidence_are_told_apart_and_errors_of_middle_values_have
     assert features(dolp=-0.1)[0, 3].unique().item() == features(dolp=1.1)[0, 3].unique().item()
 
 
-def test_squares_and_products_of_all_pairs_follow():
+def test_squares_and_products_follow_and_one_error_is_expected_until_the_fit():
     candidates, evidence = EVEN.clone(), 0.1 * EVEN
     candidates[:, 0, :, 3:] = 0.9
     computed = features(candidates, evidence=evidence, dolp=0.2)[0]
     basic = computed[:BASIC]
     pairs = [basic[j] * basic[k] for j in range(BASIC) for k in range(j, BASIC)]
     torch.testing.assert_close(computed[BASIC:], torch.stack(pairs))
-
-
-def test_it_expects_one_error_everywhere_until_it_is_fitted_and_has_nothing_to_learn():
     expected = ExpectedError()
     assert not [*expected.parameters()]
     assert expected(torch.randn(2, FEATURES, 3, 5)).unique().tolist() == [UNFITTED]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.networks.base.published import ConvGRU
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2v.e2vid import ConvLstm, E2vid, reflected
 from polarnet.networks.e2v.firenet import FireNet
@@ -116,12 +115,3 @@ def test_an_lstm_whose_forget_gate_is_open_and_input_gate_shut_keeps_its_memory(
     output, memory_after = lstm(torch.rand(1, 2, 3, 3), (torch.zeros(1, 2, 3, 3), memory))
     torch.testing.assert_close(memory_after, memory)
     torch.testing.assert_close(output, memory.tanh())
-
-
-@torch.no_grad()
-def test_a_gru_that_always_updates_forgets_its_state():
-    gru = ConvGRU(16)
-    torch.nn.init.constant_(gru.update_gate.bias, 100.0)
-    torch.nn.init.constant_(gru.reset_gate.bias, -100.0)
-    x = torch.randn(1, 16, 5, 5)
-    torch.testing.assert_close(gru(x, torch.randn(1, 16, 5, 5)), gru(x, None))

@@ -13,8 +13,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from polarnet.config.tree import load
-from polarnet.events.representations import event_counts
-from polarnet.events.stream import Events
 from polarnet.networks.polarnet import kernels
 
 CONFIG = replace(load(Path(__file__).resolve().parents[2]).networks.polarnet, channels=[8, 8, 8])
@@ -73,7 +71,7 @@ def test_the_kernels_give_the_same_bytes_on_any_number_of_threads():
         assert torch.equal(one, other)
 
 
-def test_images_in_bfloat16_are_those_of_the_torch_code_rounded():
+def test_images_in_bfloat16_are_the_rounded_ones_and_kernels_run_without_gradients_on_float32_only():
     built, inputs = network(CONFIG), counts(40, 72, windows=1)
     polarity, count = inputs.unflatten(2, (4, 2)).unbind(3)
     with torch.no_grad():
@@ -81,19 +79,8 @@ def test_images_in_bfloat16_are_those_of_the_torch_code_rounded():
         with torch.autocast("cpu", torch.bfloat16):
             _, _, rounded = built._event_sums(polarity, count, torch.ones(1, 1, 1, 1), None)
     assert torch.equal(rounded, images.to(torch.bfloat16))
-
-
-def test_kernels_run_without_gradients_on_float32_of_a_processor_only():
     with torch.no_grad():
         assert kernels.compiled_path(torch.zeros(1))
         assert not kernels.compiled_path(torch.zeros(1, dtype=torch.float64))
         assert not kernels.compiled_path(torch.zeros(1, device="meta"))
     assert not kernels.compiled_path(torch.zeros(1))
-
-
-def test_events_of_a_pixel_are_counted_and_their_polarities_summed():
-    columns = map(torch.tensor, ([1, 2, 3], [2, 2, 0], [1, 1, 0], [1, -1, -1]))
-    events = Events.from_columns(*columns, 2, 3)
-    polarity, count = event_counts(events, 10)
-    assert polarity.tolist() == [[-1, 0, 0], [0, 0, 0]]
-    assert count.tolist() == [[1, 0, 0], [0, 0, 2]]

@@ -18,12 +18,11 @@ from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.representations import event_counts
 from polarnet.events.stream import Events
-from polarnet.networks import onnx_export
+from polarnet.networks import load_network, onnx_export
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.onnx_export import check_program, random_windows
 from polarnet.networks.paper.dolp_unet import DolpUNet
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
-from polarnet.networks.registry import load_network
 
 HEIGHT, WIDTH = 30, 44  # neither divides by 8
 POLARNET = replace(

@@ -2,7 +2,6 @@ import math
 
 import pytest
 import torch
-from torch.nn import functional as F
 
 from polarnet.networks.base.blocks import contrasts
 from polarnet.networks.polarnet.redundancy import (
@@ -76,31 +75,6 @@ def test_moments_by_hand():
 
 
 @torch.no_grad()
-def test_pooled_moments_are_means_over_blocks():
-    torch.manual_seed(0)
-    events, moments = 3 * torch.randn(2, 3, 4, 8, 12), SecondMoments(3)
-    each = moments(events, pooled=1)
-    torch.testing.assert_close(moments(events, pooled=4).flatten(1, 2), F.avg_pool2d(each.flatten(1, 2), 4))
-
-
-@torch.no_grad()
-def test_noise_of_thresholds_and_steps_leaves_no_bias():
-    torch.manual_seed(0)
-    true = torch.tensor([30.0, -20.0, 10.0, 25.0]).view(1, 1, 4, 1, 1)
-    noisy = true * (1 + 0.15 * torch.randn(1, 1, 4, 500, 500))
-    corrected = SecondMoments(1)
-    corrected.log_activity.fill_(-torch.inf)
-    corrected.log_step.fill_(-torch.inf)
-    corrected.log_mismatch.fill_(math.log(0.15**2 / (1 + 0.15**2)))  # of what is seen, which holds the noise too
-    found, plain, truth = (
-        moments(events, pooled=1).mean((-1, -2)).flatten()[: MOMENTS - 1]
-        for moments, events in ((corrected, noisy), (noiseless(), noisy), (noiseless(), true))
-    )
-    torch.testing.assert_close(found, truth, atol=3.0, rtol=0)
-    assert (plain - truth).abs().max() > 15
-
-
-@torch.no_grad()
 def test_solutions_stay_physical_whatever_the_moments():
     torch.manual_seed(0)
     moments = 100 * torch.randn(5, 2, 3, 2, MOMENTS, 4, 4)
@@ -112,12 +86,9 @@ def test_solutions_stay_physical_whatever_the_moments():
     assert not any(field.any() for field in LeastSquares(1, 1, 1)(silent))  # without events nothing is polarized
 
 
-def test_running_sums_fade():
+def test_running_sums_fade_and_neighbourhoods_are_means_inside_the_image():
     sums = faded(torch.tensor([[1.0], [1.0], [2.0]]), torch.tensor([0.5, 0.0]), torch.tensor([4.0, 4.0]))
     assert sums.tolist() == [[3.0, 1.0], [2.5, 1.0], [3.25, 2.0]]
-
-
-def test_neighbourhoods_are_means_of_what_lies_inside_the_image():
     x = torch.arange(9.0).view(1, 1, 3, 3)
     one, three, everything = neighbourhoods(x, [1, 3, 0])
     assert torch.equal(one, x)

@@ -4,14 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.polarnet.refinement import (
-    GAIN,
-    USUAL_RATE,
-    ShotNoise,
-    averaged,
-    isolated_events,
-    moved_by_noise,
-)
+from polarnet.networks.polarnet.refinement import GAIN, USUAL_RATE, ShotNoise, averaged, isolated_events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 
 
@@ -53,15 +46,6 @@ def test_the_channel_that_fires_less_is_the_brighter_one_if_there_is_much_shot_n
     torch.testing.assert_close(level(events), -level(events[:, :, [2, 3, 0, 1]]))
     assert level(noise([0.005, 0.01, 0.01, 0.02])).abs().max() < 0.01
     assert level(torch.zeros(3, 1, 4, 48, 64)).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize(
-    ("stokes", "move", "moved"),
-    [((0.9, 0.0), (0.3, 0.5), (1.2 / 1.3, 0.5 / 1.3)), ((0.2, 0.1), (0.1, 0.1), (0.3, 0.2))],
-)
-def test_no_vector_becomes_longer_than_1(stokes, move, moved):
-    given = moved_by_noise(*(torch.tensor(one).view(1, 2, 1, 1) for one in (stokes, move)))
-    assert given.flatten().tolist() == pytest.approx(moved)
 
 
 def test_the_panorama_gives_the_pattern_and_the_network_the_level():

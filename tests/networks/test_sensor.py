@@ -68,15 +68,6 @@ def test_a_hot_pixel_is_silenced_and_does_not_hide_the_others():
     assert equalised.events[-10:, 0, 0, 30:, 30:].mean() > 0.9 * events[-10:, 0, 0, 30:, 30:].mean()
 
 
-@torch.no_grad()
-def test_a_threshold_for_off_events_above_that_for_on_events_is_evened_out():
-    sensitivity = torch.ones(8, HEIGHT, WIDTH)
-    sensitivity[4:] = 0.5
-    polarity, events = counts(sensitivity, 60)
-    equalised, _ = Equaliser()(polarity, events, [])
-    assert equalised.polarity[-10:].mean().abs() < 0.1 * polarity[-10:].mean().abs()
-
-
 def test_the_scale_starts_at_1_stays_within_its_limits_and_gives_way_to_a_known_value():
     torch.manual_seed(0)
     scale = Scale()

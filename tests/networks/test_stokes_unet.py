@@ -5,10 +5,8 @@ from typing import Any
 import pytest
 import torch
 from torch.nn import functional as F
-from torch.utils.flop_counter import FlopCounterMode
 
 from polarnet.config.tree import load
-from polarnet.networks.paper.dolp_unet import DolpUNet
 from polarnet.networks.polarnet.redundancy import block_means
 from polarnet.networks.polarnet.stokes_unet import PARTS, StokesUNet, StokesUNetConfig
 
@@ -64,23 +62,6 @@ def test_shot_noise_is_counted_at_single_pixels_whatever_the_blocks():
     pixels, blocks = (network(binning=side).solve_windows(inputs, [])[0].noise for side in (1, 2))
     assert pixels.isolated.min() > 0
     assert [torch.equal(one, other) for one, other in zip(pixels, blocks, strict=True)] == [True, True]
-
-
-@torch.no_grad()
-def test_before_training_it_says_the_mean_of_the_candidates_and_of_the_constant():
-    torch.manual_seed(0)
-    prediction, _ = StokesUNet(CONFIG)(torch.zeros(1, 8, 16, 16))
-    torch.testing.assert_close(prediction.dolp, torch.full((1, 16, 16), 0.3 / 16), atol=1e-5, rtol=0)
-
-
-@torch.no_grad()
-def test_it_costs_at_most_three_times_what_the_papers_network_costs():
-    def flops(built: torch.nn.Module, channels: int) -> int:
-        with FlopCounterMode(display=False) as counter:
-            built(torch.zeros(1, channels, 120, 180))
-        return counter.get_total_flops()
-
-    assert flops(StokesUNet(PARAMETERS.polarnet).eval(), 8) < 3 * flops(DolpUNet(PARAMETERS.paper), 4)
 
 
 def shot_noise(windows: int, height: int, width: int) -> torch.Tensor:

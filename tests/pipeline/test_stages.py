@@ -2,14 +2,13 @@
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import preloaded
 import pytest
 import torch
-from part_fixtures import files_of, flip
+from part_fixtures import files_of
 
 from polarnet.benchmark import cost
 from polarnet.config.origins import pipeline
@@ -93,31 +92,6 @@ def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_b
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 
-@pytest.mark.thorough
-def test_a_row_run_alone_gives_the_scores_of_one_pass_over_all_rows(project_root, data, tmp_path):
-    shutil.copytree(data / "benchmark", tmp_path / "benchmark")
-    for row in ("cf+gain", "ours", "firenet_published"):
-        run_stage(project_root, "row", data, f"row={row}", f"paths.benchmark={tmp_path / 'benchmark'}")
-        one, all_rows = (folder / "benchmark" / "rows" / row for folder in (tmp_path, data))
-        assert (one / "row.json").read_text() == (all_rows / "row.json").read_text()
-        if row != "firenet_published":  # its file is not there
-            alone, together = (json.loads((f / "simulated" / "results.json").read_text()) for f in (one, all_rows))
-            assert alone["frames"] == together["frames"]
-            assert alone["reliability"] == together["reliability"]
-
-
-@pytest.mark.thorough
-def test_a_damaged_input_ends_a_stage_with_one_line_that_names_the_file(project_root, data, tmp_path):
-    shutil.copytree(data / "scenes.zarr", tmp_path / "scenes.zarr")
-    flip(tmp_path / "scenes.zarr" / "part-00000" / "s0" / "c" / "0")
-    arguments = [*TINY, f"paths.data={tmp_path}", f"hydra.run.dir={tmp_path / 'log'}"]
-    done = preloaded.run_stage(project_root, "emulate", arguments)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stdout
-    assert done.stdout.splitlines()[-1].startswith(f"stage emulate: {tmp_path / 'scenes.zarr'}: ")
-    assert "part-00000" in done.stdout.splitlines()[-1]
-
-
 RIG = RigConfig(
     speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=60.0, full_well_electrons=20000.0,
     read_noise=2.0, hot_pixels=3,
@@ -189,27 +163,6 @@ def test_a_point_of_a_sweep_leaves_what_the_pipeline_made_and_kept_alone(project
     whole = json.loads((data / "benchmark" / "metrics.json").read_text())["simulated"]
     assert point["test"] == own["ours"] != whole["ours"]
     assert own["oracle_mean"]["mse"] == whole["oracle_mean"]["mse"]
-
-
-@pytest.mark.thorough
-def test_a_removed_method_is_in_no_table_and_no_picture_though_its_files_are_there(project_root, data, tmp_path):
-    """The report alone, over rows among which `highpass` still lies."""
-    folders = {name: tmp_path / name for name in ("benchmark", "report")}
-    shutil.copytree(data / "benchmark", folders["benchmark"])
-    settings = [f"paths.{name}={folder}" for name, folder in folders.items()]
-    settings.append("benchmark.methods=[zeros,train_mean,oracle_mean,cf,ours]")
-    run_stage(project_root, "report", data, *settings)
-    before, after = (
-        json.loads((folder / "metrics.json").read_text())["simulated"]
-        for folder in (data / "benchmark", folders["benchmark"])
-    )
-    assert set(after) == {"zeros", "train_mean", "oracle_mean", "cf", "ours"}
-    assert all(after[row] == before[row] for row in after)
-    full, reduced = ((folder / "index.html").read_text() for folder in (data / "report", folders["report"]))
-    assert 'class="m-highpass"' in full
-    assert ">high-pass<" in full
-    assert 'class="m-highpass"' not in reduced
-    assert ">high-pass<" not in reduced
 
 
 @pytest.mark.parametrize(

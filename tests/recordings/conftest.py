@@ -1,9 +1,6 @@
 import pytest
-from event_fixtures import make_events, make_random_events, same_events
 
 from polarnet.recordings.recording import read_recording
-
-__all__ = ["make_events", "make_random_events", "same_events"]
 
 
 def columns_of(events):

@@ -36,7 +36,9 @@ def pipe():
         yield source, camera
 
 
-def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
+def test_what_is_written_as_lines_is_read_back_and_a_mosaic_gives_pixels_to_polarizers(
+    tmp_path, make_random_events, columns
+):
     channels = [make_random_events(seed, 200, 10_000, 20, 30) for seed in range(4)]
     head, times, lines = live_lines(channels)
     live, pieces = read_lines(tmp_path, (head + lines).decode())
@@ -48,21 +50,24 @@ def test_what_is_written_as_lines_is_read_back(tmp_path, make_random_events):
         for name in "xyp":
             assert torch.equal(torch.cat([getattr(p.channels[k], name) for p in pieces]), getattr(events, name))
     assert pieces[-1].until_us == int(times[-1]) - first
-
-
-def test_commas_comments_zeros_and_a_last_line_without_an_end_are_read(tmp_path, columns):
-    _, pieces = read_lines(tmp_path, "4 3\n# t x y p angle\n100,1,2,0,0\n150 3 0 1 135\n160 0 0 -1 90")
-    events = [event for piece in pieces for e in piece.channels for event in zip(*columns(e), strict=True)]
-    assert sorted(events) == [(0, 1, 2, -1), (50, 3, 0, 1), (60, 0, 0, -1)]
-
-
-def test_a_mosaic_gives_each_pixel_to_its_polarizer(tmp_path, columns):
     live, (piece,) = read_lines(tmp_path, "4 2\n10 0 0 1\n11 1 0 1\n12 2 1 1\n13 3 1 1\n", MOSAIC)
     assert (live.height, live.width) == (1, 2)
     assert [columns(channel)[:2] for channel in piece.channels] == [[[3], [1]], [[1], [0]], [[0], [0]], [[2], [1]]]
 
 
-def test_lines_are_handed_on_as_they_come_through_a_pipe():
+def test_comments_commas_zeros_and_a_last_line_without_an_end_are_read(tmp_path, columns):
+    _, pieces = read_lines(tmp_path, "4 3\n# t x y p angle\n100,1,2,0,0\n150 3 0 1 135\n160 0 0 -1 90")
+    events = [event for piece in pieces for e in piece.channels for event in zip(*columns(e), strict=True)]
+    assert sorted(events) == [(0, 1, 2, -1), (50, 3, 0, 1), (60, 0, 0, -1)]
+    with pipe() as (source, camera):
+        camera.write(b"# a camera\n\n")
+        threading.Timer(0.05, camera.write, [b"  # its size\n4 3 # px\n0 0 0 1 0\n"]).start()
+        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        assert (live.height, live.width) == (3, 4)
+        assert next(iter(live)).until_us == 0
+
+
+def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads():
     with pipe() as (source, camera):
         camera.write(b"4 3\n")
         pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
@@ -72,6 +77,16 @@ def test_lines_are_handed_on_as_they_come_through_a_pipe():
         assert next(pieces).until_us == 15
         camera.close()
         assert list(pieces) == []
+    with pipe() as (source, camera):
+        camera.write(b"4 3\n")
+        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        before = time.perf_counter()
+        camera.write(b"0 0 0 1 0\n10 0 0 1 0\n")
+        camera.close()
+        while live._queue.qsize() < 2:
+            time.sleep(0.001)
+        after = time.perf_counter()
+        assert all(before <= piece.read_at <= after for piece in live)
 
 
 def test_a_file_that_grows_is_followed(tmp_path):
@@ -117,28 +132,6 @@ def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
 def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
     with pytest.raises(RecordingError, match=reason):
         read_lines(tmp_path, text)
-
-
-def test_lines_keep_the_time_at_which_they_came_while_nobody_reads():
-    with pipe() as (source, camera):
-        camera.write(b"4 3\n")
-        live = LiveLines(source, "pipe", None, idle_s=0.0)
-        before = time.perf_counter()
-        camera.write(b"0 0 0 1 0\n10 0 0 1 0\n")
-        camera.close()
-        while live._queue.qsize() < 2:
-            time.sleep(0.001)
-        after = time.perf_counter()
-        assert all(before <= piece.read_at <= after for piece in live)
-
-
-def test_comments_may_come_before_the_size_in_pieces_of_their_own():
-    with pipe() as (source, camera):
-        camera.write(b"# a camera\n\n")
-        threading.Timer(0.05, camera.write, [b"  # its size\n4 3 # px\n0 0 0 1 0\n"]).start()
-        live = LiveLines(source, "pipe", None, idle_s=0.0)
-        assert (live.height, live.width) == (3, 4)
-        assert next(iter(live)).until_us == 0
 
 
 def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
@@ -228,14 +221,11 @@ def test_events_sent_over_loopback_arrive_in_their_channels(sender, make_random_
     assert len(pieces) >= 2
 
 
-def test_nobody_at_the_address_is_reported(dv):
+def test_without_a_camera_or_dv_processing_the_error_says_so(dv, monkeypatch):
     with pytest.raises(RecordingError, match="cannot be reached"):
         LiveCamera(f"dv://127.0.0.1:{free_port()}", MOSAIC, idle_s=1.0)
     with pytest.raises(ValueError, match="expected dv://HOST:PORT or dv://camera"):
         LiveCamera("dv://somewhere", MOSAIC, idle_s=1.0)
-
-
-def test_without_dv_processing_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "dv_processing", None)
     with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[recordings\]' in the clone"):
         LiveCamera("dv://127.0.0.1:7777", MOSAIC, idle_s=1.0)

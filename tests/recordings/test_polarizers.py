@@ -3,15 +3,13 @@
 import dataclasses
 import itertools
 
-import numpy as np
 import pytest
 import torch
 
 from polarnet.events.mosaic import join_mosaic, split_mosaic
-from polarnet.events.stream import Events, merge
-from polarnet.events.streaming import WindowCutter, WindowRule
+from polarnet.events.stream import Events
 from polarnet.recordings.arrangements import Piece, read_mosaic
-from polarnet.recordings.polarizers import WINDOW_US, ChannelCheck, pair_misfits
+from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate
 from polarnet.simulation.scene import polarization_from_rgb
 from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -44,11 +42,6 @@ def camera_of(channels):
     return join_mosaic([split_mosaic(events, SONY)[number] for number, events in enumerate(channels)], SONY)
 
 
-def windows_of(channels):
-    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
-    return list(cutter.add(channels, DURATION_US))
-
-
 def findings(channels, *, mosaic=False):
     check = ChannelCheck(channels[0].height, channels[0].width, mosaic=mosaic)
     piece = Piece(channels, DURATION_US, 0.0)
@@ -78,10 +71,9 @@ def test_every_order_of_a_mosaic_that_changes_dolp_is_named(polarized, order):
     assert ("another order" in warning) == (not right_angles(order))
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_a_mosaic_without_polarizers_is_named_whatever_its_order(unpolarized, order):
-    channels = split_mosaic(camera_of(unpolarized), order)
-    assert "Either the recording was made without polarizers, or its scene is hardly" in findings(channels, mosaic=True)
+def test_a_mosaic_without_polarizers_is_named_whatever_its_order(unpolarized):
+    sentence = "Either the recording was made without polarizers, or its scene is hardly"
+    assert all(sentence in findings(split_mosaic(camera_of(unpolarized), order), mosaic=True) for order in ORDERS[::5])
 
 
 def test_channels_that_cannot_be_right_are_named(polarized, unpolarized):
@@ -89,17 +81,6 @@ def test_channels_that_cannot_be_right_are_named(polarized, unpolarized):
     assert "The four channels show the same" in findings(unpolarized)
     assert "The four channels are the same" in findings([polarized[0]] * 4)
     assert "no events behind the polarizer at 45 degrees" in findings([polarized[0], silent, *polarized[2:]])
-
-
-def test_a_hot_pixel_changes_nothing(polarized):
-    t = torch.arange(0, DURATION_US, 10)
-    one = torch.full_like(t, 7).to(torch.int16)
-    hot = Events(t, one, one, torch.ones_like(t).to(torch.int8), polarized[0].height, polarized[0].width)
-    bad = np.zeros((4, hot.height, hot.width), bool)
-    before, _ = pair_misfits(windows_of(polarized), [*bad])
-    bad[0, 7, 7] = True
-    after, _ = pair_misfits(windows_of([merge([polarized[0], hot]), *polarized[1:]]), [*bad])
-    np.testing.assert_allclose(after, before, rtol=0.01)
 
 
 @pytest.mark.parametrize(("rate_hz", "sentence"), [(5_000, ""), (20_000, "Hot pixels with more than 10,000 events")])

@@ -1,14 +1,16 @@
 import gzip
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
 
+from polarnet.recordings.arrangements import read_four, read_mosaic
 from polarnet.recordings.formats import hdf5, lines, prophesee
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
+from polarnet.stokes import parse_mosaic
 from studies.celex5_writer import write_celex5_csv
 from studies.recording_files import FILES
 
@@ -39,24 +41,6 @@ def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
     assert (recording.format, len(recording.events), recording.repairs) == ("dat", 2009, {})
 
 
-@pytest.mark.shared
-def test_an_evt3_file_equals_its_decoded_columns_up_to_turns_of_a_clock_that_did_not_turn(shared):
-    """The reference's decoder takes each step back of the low time word, by 3 to 11 us, for a turn of 4096 us.
-
-    The file's high time words grow by 2, so its last events are at 2863 * 4096 + 609 us.
-    """
-    folder = shared / "data" / "recordings" / "prophesee"
-    expected = np.load(folder / "evt3_sample_expected.npy")
-    events = read_recording(folder / "evt3_sample.raw").events
-    assert np.array_equal(events.x.numpy(), expected["x"])
-    assert np.array_equal(events.y.numpy(), expected["y"])
-    assert np.array_equal(events.p.numpy() > 0, expected["p"] == 1)
-    later = expected["t"] - events.t.numpy()
-    assert np.unique(later).tolist() == [4096 * k for k in range(12)]
-    assert (np.diff(later) >= 0).all()
-    assert int(events.t[-1]) == 2863 * 4096 + 609
-
-
 @pytest.mark.parametrize("chunk_events", [1, 7, 999, 1000, 10**6])
 def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, chunk_events):
     events = make_random_events(0, 1000, 10**6)
@@ -68,16 +52,13 @@ def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_e
         assert torch.equal(torch.cat([getattr(chunk, name) for chunk in chunks]), getattr(events, name))
 
 
-def test_iterating_again_starts_again_and_counts_again(tmp_path):
+def test_a_recording_may_be_iterated_again_and_may_have_no_events(tmp_path, read):
     (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n4 1 2 1\n6 1 2 0\n")
     reader = open_recording(tmp_path / "e.txt")
     for _ in range(2):
         (chunk,) = reader
         assert chunk.t.tolist() == [4, 5, 6]
         assert reader.repairs["unsorted"] == 1
-
-
-def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, read):
     (tmp_path / "e.txt").write_text("18 12\n")
     assert read(tmp_path / "e.txt") == (("text", 12, 18), [[]] * 4, {})
 
@@ -86,10 +67,7 @@ def test_a_recording_without_events_is_an_empty_stream_of_its_sensor(tmp_path, r
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (
-            b"\x00\x01\x02\xff" * 100,
-            "of none of the formats e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag",
-        ),
+        (b"\x00\x01\x02\xff" * 100, "of none of the formats e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag"),
         (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
         (b"1,2,3,4,5,6\n", "of none of the formats"),
     ],
@@ -151,7 +129,7 @@ def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FILES if kind != "celex5_bin"])
-def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, make_random_events, same_events):
+def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, make_random_events):
     suffix, write = FILES[kind]
     events = make_random_events(1, 30_000, 10**6, 260, 346)
     events = replace(events, height=800, width=1280) if kind == "celex5_csv" else events
@@ -160,4 +138,36 @@ def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, ma
     part = {"m3ed": "left", "mvsec": "left"}.get(kind)
     recording = read_recording(tmp_path / f"e{suffix}", part=part)
     assert (kind.split()[0].rstrip(","), recording.repairs) == (recording.format, {})
-    assert same_events(recording.events, events)
+    assert equal(recording.events, events)
+
+
+ANGLES = (0, 45, 90, 135)
+
+
+def test_four_files_in_any_order_or_one_mosaic_become_the_four_channels(tmp_path, make_random_events):
+    events = {angle: make_random_events(angle, 200, 60_000) for angle in (90, 0, 135, 45)}
+    files = {angle: tmp_path / f"camera_{k}.csv" for k, angle in enumerate(events)}
+    for angle, path in files.items():
+        write_celex5_csv(path, events[angle])
+    first = min(int(e.t[0]) for e in events.values())
+    channels = read_four({-45 if angle == 135 else angle: path for angle, path in files.items()})
+    for angle, channel in zip(ANGLES, channels, strict=True):
+        assert torch.equal(channel.t, events[angle].t - first)
+        assert torch.equal(channel.x, events[angle].x)
+    starts = {0: 5000, 45: 6000, 90: 7000, 135: 8000}
+    for angle, channel in zip(ANGLES, read_four(files, starts), strict=True):
+        assert torch.equal(channel.t, events[angle].t[events[angle].t >= starts[angle]] - starts[angle])
+    events = make_random_events(1, 200, 60_000)
+    write_celex5_csv(tmp_path / "a.csv", events)
+    channels = read_mosaic(tmp_path / "a.csv", parse_mosaic("90 45 / 135 0"))
+    assert min(int(c.t[0]) for c in channels) == 0
+    assert sum(map(len, channels)) == len(events)
+
+
+def test_an_angle_that_is_missing_or_twice_there_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match=r"one file for each of 0, 45, 90 and 135 degrees, got \[0, 45, 90\]"):
+        read_four(dict.fromkeys((0, 45, 90), tmp_path / "a"))
+    with pytest.raises(RecordingError, match=r"got \[0, 45, 90, 135, 180\]"):
+        read_four(dict.fromkeys((0, 45, 90, 135, 180), tmp_path / "a"))
+    with pytest.raises(RecordingError, match="a start for each of the angles"):
+        read_four(dict.fromkeys(ANGLES, tmp_path / "a"), {0: 1})

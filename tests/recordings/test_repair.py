@@ -32,32 +32,23 @@ def test_polarity_0_and_minus_1_both_mean_darker(darker):
     assert counts == {}
 
 
-def test_a_few_polarities_of_the_other_kind_are_left_out():
+def test_a_few_events_of_another_polarity_or_off_the_sensor_are_left_out_and_many_refused():
     rows, counts = read([[(t, 1, 1, 1 - 2 * (t % 2)) for t in range(50)] + [(50, 1, 1, 0), (51, 1, 1, 7)]])
     assert len(rows) == 50
     assert counts == {"bad_polarity": 2}
-
-
-def test_a_few_events_off_the_sensor_are_left_out_and_many_refused():
     inside = at(range(100))
     rows, counts = read([[*inside, (100, 10, 0, 1), (100, 0, -1, 1), (100, 0, 10, 1)]])
     assert (len(rows), counts) == (100, {"out_of_range": 3})
     with pytest.raises(RecordingError, match="Is the format right, and the size of the sensor"):
         read([[*inside, *[(100, 10, 0, 1)] * 9]])
-
-
-def test_coordinates_larger_than_int16_do_not_wrap_onto_the_sensor():
     rows, counts = read([[*at(range(20)), (20, 65536 + 3, 2, 1)]])
     assert (len(rows), counts) == (20, {"out_of_range": 1})
 
 
-def test_late_events_are_put_in_order_across_blocks():
+def test_late_events_are_put_in_order_across_blocks_and_those_of_equal_time_keep_theirs():
     rows, counts = read([at([0, 100, 5000]), at([4000, 5001]), at([1, 6000])])
     assert times_of(rows) == [0, 1, 100, 4000, 5000, 5001, 6000]
     assert counts == {"unsorted": 2}
-
-
-def test_events_of_equal_time_keep_their_order():
     rows, _ = read([[(5, 1, 0, 1), (5, 2, 0, 1), (3, 3, 0, 1), (5, 4, 0, 1), (3, 5, 0, 1)]])
     assert [x for _, x, *_ in rows] == [3, 5, 1, 2, 4]
 
@@ -140,15 +131,12 @@ def test_a_camera_that_was_reset_goes_on_even_if_its_events_come_one_by_one(capl
     assert sum("camera's clock goes from" in message for message in caplog.messages) == 1
 
 
-def test_events_before_a_reset_are_handed_on_first():
+def test_events_before_a_reset_come_first_and_times_that_fall_all_the_time_are_refused():
     rows = at([*STEADY, *STEADY])
     blocks = repaired("a.bin", lambda counts: iter([Block(*np.array(rows).T)]), (10, 10), Counts())
     assert next(blocks).t.tolist() == STEADY
     with pytest.raises(RecordingError, match=r"a\.bin: after event 3000, time goes back by 2999000 us"):
         next(blocks)
-
-
-def test_times_that_fall_all_the_time_are_refused_and_not_dropped_as_stale():
     with pytest.raises(RecordingError, match="and stays there"):
         read([at(range(10**8, 0, -20_000))])
     assert MAX_STALE < MAX_RUN

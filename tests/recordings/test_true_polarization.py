@@ -14,7 +14,7 @@ from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities
 
 pytest.importorskip("h5py")
 
-from studies.recording_files import mosaicked, write_e2p
+from studies.recording_files import NO_FRAMES, NO_TIMES, mosaicked, write_aedat2, write_e2p
 
 MOSAIC = parse_mosaic("90 45 / 135 0")
 T_US = np.array([1000, 34_000, 67_000])
@@ -40,7 +40,7 @@ def known(height, width):
     return raw, dolp(stokes), aolp(stokes)
 
 
-def test_demosaicked_frames_of_e2p_give_the_known_polarization(tmp_path, make_events):
+def test_demosaicked_frames_of_e2p_give_the_known_polarization_but_for_saturated_cells(tmp_path, make_events):
     raw, true_dolp, true_aolp = known(20, 24)
     write_e2p(tmp_path / "e.h5", make_events([(0, 0, 0, 1)], 20, 24), T_US, np.stack([raw] * 3), None)
     truth = read_truth(tmp_path / "e.h5", MOSAIC)
@@ -51,6 +51,13 @@ def test_demosaicked_frames_of_e2p_give_the_known_polarization(tmp_path, make_ev
     assert (truth.dolp[inside] - true_dolp[None][inside]).abs().max() < 1e-7
     assert (truth.aolp[inside] - true_aolp[None][inside]).abs().max() < 1e-6
     assert true_dolp.min() > 0.05
+    raw, _, _ = known(20, 24)
+    raw[8, 8] = raw[9, 8] = 255
+    maps = tuple(np.zeros((3, 10, 12)) for _ in range(3))
+    write_e2p(tmp_path / "e.h5", make_events([(0, 0, 0, 1)], 20, 24), T_US, np.stack([raw] * 3), maps)
+    valid = read_truth(tmp_path / "e.h5", MOSAIC).valid
+    assert not valid[:, 4, 4].any()
+    assert valid.sum() == 3 * (10 * 12 - 1)
 
 
 def test_maps_of_e2p_are_the_truth_where_the_file_has_them(tmp_path, make_events):
@@ -67,46 +74,21 @@ def test_maps_of_e2p_are_the_truth_where_the_file_has_them(tmp_path, make_events
     np.testing.assert_allclose(truth.light, mosaicked(2 * truth.intensity.numpy()))
 
 
-def test_cells_with_saturated_pixels_are_not_valid(tmp_path, make_events):
-    raw, _, _ = known(20, 24)
-    raw[8, 8] = raw[9, 8] = 255
-    maps = tuple(np.zeros((3, 10, 12)) for _ in range(3))
-    write_e2p(tmp_path / "e.h5", make_events([(0, 0, 0, 1)], 20, 24), T_US, np.stack([raw] * 3), maps)
-    valid = read_truth(tmp_path / "e.h5", MOSAIC).valid
-    assert not valid[:, 4, 4].any()
-    assert valid.sum() == 3 * (10 * 12 - 1)
-
-
-def samples(raw, reset_us, signal_us, reset_level=900):
-    """A frame of AEDAT-2: first the reset of every pixel, then its signal; rows count from the bottom."""
-    height, width = raw.shape
-    y, x = np.mgrid[:height, :width]
-    place = (1 << 31) | (height - 1 - y).ravel() << 22 | x.ravel() << 12
-    signal = place | 1 << 10 | (reset_level - raw.ravel().astype(np.int64))
-    times = np.repeat([reset_us, signal_us], place.size)
-    return np.stack([np.concatenate([place | reset_level, signal]), times], axis=1)
-
-
-HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
-
-
-def write_aedat2(path, frames, events=()):
-    words = [samples(raw, start, stop) for raw, start, stop in frames]
-    words += [np.array([[(259 - y) << 22 | (345 - x) << 12 | p << 11, t]]) for t, x, y, p in events]
-    entries = np.concatenate(words)
-    path.write_bytes(HEADER + entries[np.argsort(entries[:, 1], kind="stable")].astype(">u4").tobytes())
-    return path
-
-
-def test_frames_of_a_davis_are_the_difference_of_two_samples_in_the_middle_of_the_exposure(tmp_path):
+def test_frames_of_a_davis_are_differences_of_two_samples_and_need_all_of_them(tmp_path, make_events):
     raw, true_dolp, _ = known(260, 346)  # levels beyond 255 wrap, which changes nothing here
-    path = write_aedat2(tmp_path / "e.aedat", [(raw, 1000, 9000), (raw // 2, 31_000, 39_000)], [(5000, 3, 4, 1)])
+    path, events = tmp_path / "e.aedat", make_events([(5000, 3, 4, 1)], 260, 346)
+    write_aedat2(path, events, np.array([5000, 35_000]), np.stack([raw, raw // 2]))
     frames = aedat2_frames(path)
     assert frames.t_us.tolist() == [5000, 35_000]
     assert np.array_equal(frames.levels, [raw, raw // 2])
     truth = read_truth(path, MOSAIC)
     near = np.s_[1:20, 1:20]  # where no level wraps
     assert (truth.dolp[0][near] - true_dolp[near]).abs().max() < 1e-6
+    path.write_bytes(path.read_bytes()[:-8])
+    assert aedat2_frames(path).t_us.tolist() == [5000]
+    write_aedat2(path, events, NO_TIMES, NO_FRAMES)
+    with pytest.raises(RecordingError, match="expected frames of the DAVIS as true polarization, there are none"):
+        aedat2_frames(path)
 
 
 def write_aedat4(path, frames, events):
@@ -139,15 +121,6 @@ def test_frames_of_aedat4_have_the_middle_of_their_exposure_and_the_known_polari
     faery.events_stream_from_file(tmp_path / "e.aedat4").to_file(tmp_path / "events.aedat4")
     with pytest.raises(RecordingError, match="expected raw frames of one size and one channel"):
         read_truth(tmp_path / "events.aedat4", MOSAIC)
-
-
-def test_a_frame_without_all_its_samples_is_left_out(tmp_path):
-    raw, _, _ = known(260, 346)
-    path = write_aedat2(tmp_path / "e.aedat", [(raw, 1000, 9000), (raw, 31_000, 39_000)])
-    path.write_bytes(path.read_bytes()[:-8])
-    assert aedat2_frames(path).t_us.tolist() == [5000]
-    with pytest.raises(RecordingError, match="expected frames of the DAVIS as true polarization, there are none"):
-        aedat2_frames(write_aedat2(tmp_path / "f.aedat", [(raw[:100], 1000, 9000)]))
 
 
 def test_files_without_frames_say_what_they_lack(tmp_path, make_events):

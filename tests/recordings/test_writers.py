@@ -42,7 +42,7 @@ def test_an_exported_store_reads_back_as_recordings(store, tmp_path, form, suffi
     assert contents["attributes"] == store.attributes
 
 
-def test_hdf5_has_dsecs_names_and_types(make_events, tmp_path):
+def test_hdf5_has_dsecs_names_and_types_and_text_is_what_e2vid_reads(make_events, tmp_path):
     """DSEC: t[ms_to_idx[k]] >= 1000 k > t[ms_to_idx[k] - 1]; polarity 0 or 1."""
     events = make_events([(0, 1, 2, 1), (999, 3, 4, -1), (1000, 5, 6, 1), (2500, 7, 8, -1)], HEIGHT, WIDTH)
     write_hdf5(tmp_path / "e.h5", events, 3000)
@@ -56,9 +56,6 @@ def test_hdf5_has_dsecs_names_and_types(make_events, tmp_path):
         assert file["events/p"][:].tolist() == [1, 0, 1, 0]
         assert file["ms_to_idx"][:].tolist() == [0, 2, 3, 4]
         assert file["t_offset"][()] == 0
-
-
-def test_text_is_what_e2vid_reads(make_events, tmp_path):
     write_text(tmp_path / "e.txt", make_events([(5, 1, 2, 1), (1_000_001, 3, 4, -1)], HEIGHT, WIDTH), 2_000_000)
     assert (tmp_path / "e.txt").read_text() == "18 12\n0.000005 1 2 1\n1.000001 3 4 0\n"
 
@@ -104,20 +101,17 @@ def test_times_that_a_format_cannot_hold_are_refused(write, times, make_events, 
         write(tmp_path / "e", chunks, None)
 
 
-def test_evt3_refuses_a_sensor_with_more_columns_than_its_words_count(make_events, tmp_path):
+def test_a_sensor_that_evt3_cannot_count_and_an_unknown_form_are_refused(make_events, tmp_path, store):
     with pytest.raises(ValueError, match="up to 2048 px a side, got 4x2049"):
         write_evt3(tmp_path / "e.raw", make_events([], 4, 2049), 1000)
+    with pytest.raises(ValueError, match="expected a form of hdf5, text, evt3, got 'aedat'"):
+        export_store(store, tmp_path, "aedat")
 
 
 def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(RuntimeError, match=r"run pip install -e '\.\[recordings\]' in the clone"):
         write_hdf5(tmp_path / "e.h5", make_events([], 1, 1), 1000)
-
-
-def test_an_unknown_form_is_refused(store, tmp_path):
-    with pytest.raises(ValueError, match="expected a form of hdf5, text, evt3, got 'aedat'"):
-        export_store(store, tmp_path, "aedat")
 
 
 def test_hdf5_on_a_full_disk_ends_with_the_error_of_the_disk_and_the_process_goes_on(tmp_path):

@@ -78,9 +78,7 @@ def method(clock, work_s, taken):
 
 @pytest.mark.parametrize(("step_us", "windows"), [(None, 150), (2_000, 746)])
 @pytest.mark.parametrize("work_s", [0.012, 0.04, 0.1])
-def test_windows_are_joined_where_the_processor_does_not_keep_up_and_no_event_is_lost(
-    clock, tmp_path, monkeypatch, step_us, windows, work_s
-):
+def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkeypatch, step_us, windows, work_s):
     taken: list[int] = []
     camera, rule = source(waits=False), WindowRule(WINDOW_US, None, step_us)
     frames = list(frames_of(camera, rule, method(clock, work_s, taken)))
@@ -98,7 +96,7 @@ def test_windows_are_joined_where_the_processor_does_not_keep_up_and_no_event_is
     assert facts["joined"].startswith(f"{sum(joined)} windows to {len(joined)} frames: the processor did not keep up")
 
 
-def test_windows_stay_apart_where_the_processor_keeps_up_after_a_delay(clock):
+def test_windows_stay_apart_if_the_processor_keeps_up_or_the_source_waits(clock):
     frames = frames_of(source(waits=False), WindowRule(WINDOW_US, None, None), method(clock, 0.005, []))
     beginning = list(itertools.islice(frames, 20))
     clock.now_s += 0.3
@@ -106,9 +104,6 @@ def test_windows_stay_apart_where_the_processor_keeps_up_after_a_delay(clock):
     assert [frame.window.joined for frame in (*beginning, *rest)] == [1] * 150
     assert rest[0].latency_s > 0.2
     assert rest[-1].latency_s < 0.01
-
-
-def test_a_source_that_waits_keeps_its_windows_however_slow_the_processor_is(clock):
     frames = list(frames_of(source(waits=True), WindowRule(WINDOW_US, None, None), method(clock, 0.1, [])))
     assert [frame.window.stop_us for frame in frames] == [*range(WINDOW_US, 1_500_001, WINDOW_US)]
 
@@ -125,7 +120,7 @@ def test_what_is_read_ahead_comes_in_order_and_an_error_after_what_was_before_it
             next(items)
 
 
-def test_a_thread_that_reads_ahead_ends_when_nobody_reads_on():
+def test_reading_ahead_ends_with_its_reader_and_is_bounded_in_memory():
     before, taken = threading.active_count(), []
     with Ahead(map(taken.append, itertools.count()), 3) as ahead:
         next(iter(ahead))
@@ -133,9 +128,6 @@ def test_a_thread_that_reads_ahead_ends_when_nobody_reads_on():
     while threading.active_count() > before:
         time.sleep(0.001)
     assert len(taken) <= 7
-
-
-def test_memory_of_what_waits_is_bounded():
     read = []
     ahead = Ahead((read.append(k) or k for k in range(100)), 4)
     while len(read) < 5:  # four in the queue, and the one that waits for room

@@ -15,11 +15,9 @@ from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
+from polarnet.networks import load_network, shipped_weights
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.e2v.firenet import FireNet
-from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
-from polarnet.networks.registry import load_network
-from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
 from polarnet.recovery.inputs import Files, open_files
@@ -28,19 +26,11 @@ from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
 HEIGHT, WIDTH, DURATION_US, ANGLES = 16, 20, 100_000, (0, 45, 90, 135)
-NETWORK = {
-    "channels": [4, 8, 8], "swin_depth": 2, "swin_window": 4, "swin_heads": [2, 2], "residual_blocks": 1,
-    "input_mixing": "contrasts",
-}  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory):
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("weights") / "mine.safetensors"
-    metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
-    save_checkpoint(path, DolpUNet(DolpUNetConfig(**NETWORK)).state_dict(), metadata)
-    return path
+@pytest.fixture
+def weights(checkpoints):
+    return checkpoints["paper"]
 
 
 def write_lines(path, events):
@@ -84,17 +74,10 @@ def test_a_store_four_files_and_lines_that_come_give_the_same(store, channels, w
         np.testing.assert_allclose(frames["dolp"].astype(float), expected["dolp"], atol=3)
 
 
-def test_a_mosaic_is_one_file_with_channels_of_half_its_size(make_channel, tmp_path, at_root, capsys):
-    whole = write_lines(tmp_path / "camera.txt", make_channel(1, 2 * HEIGHT, 2 * WIDTH))
-    options = ("--mosaic", "90 45 / 135 0", "--method", "cf+gain", "--window", "500ev", "--step", "5ms")
-    assert run(whole, *options, out=tmp_path / "out") == 0
-    assert recovered(tmp_path / "out")["dolp"].shape[1:] == (HEIGHT, WIDTH)
-
-
 @pytest.mark.parametrize(
     ("asked", "units", "taken"), [("auto", ["AMX"], "bf16"), ("auto", [], "fp32"), ("fp32", ["AMX"], "fp32")]
 )
-def test_the_network_computes_in_bfloat16_where_there_are_units_for_it(
+def test_bfloat16_is_used_where_there_are_units_for_it(
     store, weights, tmp_path, monkeypatch, capsys, asked, units, taken
 ):
     monkeypatch.setattr(runtime, "bf16_units", lambda device: units)
@@ -179,7 +162,7 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
 
 
 @pytest.mark.parametrize("method", ["highpass", "e2v"])
-def test_a_method_that_reconstructs_intensity_gives_the_video_of_a_camera_without_polarizers(
+def test_reconstructed_intensity_is_the_video_of_a_camera_without_polarizers(
     method, channels, tmp_path, at_root, capsys
 ):
     file = write_lines(tmp_path / "camera.txt", channels[1])
@@ -258,10 +241,7 @@ def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, ca
         ([one], "say where the polarizers of its pixels are"),
         ([one, one], "four files with --angles, got 2"),
         ([one] * 4, "say the polarizer of each"),
-        (
-            [one] * 4 + ["--angles", 0, 45, 90, 90],
-            "one file for each of 0, 45, 90 and 135 degrees, got [0, 45, 90]",
-        ),
+        ([one] * 4 + ["--angles", 0, 45, 90, 90], "one file for each of 0, 45, 90 and 135 degrees, got [0, 45, 90]"),
         ([one, "--angles", 0, 45, 90, 135], "four files with --angles, got 1"),
         ([one, "--mosaic", "90 45 / 135 0", "--angles", 0, 45, 90, 135], "got --angles, --mosaic"),
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),

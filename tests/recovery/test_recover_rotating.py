@@ -9,11 +9,10 @@ from polarnet.cli import main
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import write_hdf5
 from polarnet.recovery.inputs import rotation_of
+from polarnet.simulation import SENSORS, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import resting_trajectory
-from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
-from polarnet.simulation.scene import scene_from_polarization
 
 HEIGHT, WIDTH, RATE_HZ, START_DEG = 8, 10, 5.0, 20.0
 

@@ -43,16 +43,13 @@ def written(tmp_path, cores):
     return tmp_path
 
 
-def test_the_numbers_are_in_a_zarr_group_of_its_own(written):
+def test_the_numbers_the_pictures_the_video_and_a_page_that_escapes_names_are_written(written):
     group = zarr.open_group(written / "recovered.zarr", mode="r")
     assert group["t_us"][:].tolist() == [1000 * (k + 1) for k in range(FRAMES)]
     np.testing.assert_allclose(group["dolp"][:, 0, 0] / 65535, np.arange(FRAMES) / FRAMES, atol=1e-5)
     np.testing.assert_allclose(group["aolp"][:, 3, 4] * np.pi / 65536, 0.05 * np.arange(FRAMES), atol=1e-4)
     np.testing.assert_allclose(group["log_variance"][:, 3, 4], -np.arange(FRAMES) / FRAMES, rtol=1e-6)
     assert set(group.attrs["conventions"]) == {"t_us", "dolp", "aolp", "log_variance"}
-
-
-def test_pictures_show_three_maps_side_by_side_and_the_video_labels_them(written):
     picture = cv2.imread(str(written / "png" / "000039.png"))
     assert picture.shape == (16, 72, 3)  # 3 * 21 + 2 * 4, brought to even sides
     assert len(list((written / "png").iterdir())) == FRAMES
@@ -61,9 +58,6 @@ def test_pictures_show_three_maps_side_by_side_and_the_video_labels_them(written
         count += 1
     assert count == FRAMES
     assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 536  # 2 enlarged panels of 252, a gap of 8, margins of 12
-
-
-def test_the_page_needs_no_network_and_escapes_names(written):
     page = (written / "index.html").read_text()
     assert "a &amp; b" in page
     assert "one note" in page

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.presets import SENSORS
+from polarnet.simulation import SENSORS, EmulatorConfig, emulate
 
 V2E_CASES = [
     "clean", "clean_synth", "clean_float", "clean_irregular", "clean_t0_2p5", "asym_thres", "cutoff15",

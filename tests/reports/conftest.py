@@ -19,8 +19,7 @@ from polarnet.runtime.files import seal
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import Synthesis, synthesize
 from polarnet.stokes import Prediction
-from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage import EventStore, FrameStore
 from polarnet.training.engine.recorder import write_history
 
 SPLITS = {"park": "train", "lake": "val", "tree": "test", "leaf": "test"}

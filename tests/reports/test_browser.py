@@ -1,7 +1,13 @@
 """The pages in headless Chromium: they work, show everything, and ask for nothing outside."""
 
+import contextlib
+import shutil
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
 import pytest
-from browser_fixtures import axe_serious, chromium_path, cut_off, opened, settle, wear
 
 from polarnet.reports.artefacts import Run
 from polarnet.reports.page import write_report
@@ -9,8 +15,77 @@ from polarnet.reports.player import write_player
 from polarnet.reports.viewing import films_of
 
 pytest.importorskip("playwright", reason="playwright is not installed: pip install 'polarnet[dev]'")
-if chromium_path() is None:
+if shutil.which("chromium") is None:
     pytest.skip("no Chromium was found: install Debian's chromium", allow_module_level=True)
+
+SERIOUS = ("serious", "critical")
+TIMEOUT_MS = 20_000
+CUT_OFF = """() => [document.documentElement, ...document.querySelectorAll("section, table, figure, td, th, details")]
+  .filter((one) => one.scrollWidth > one.clientWidth + 1 && one.clientWidth > 0)
+  .filter((one) => !one.closest("thead") || getComputedStyle(one.closest("thead")).clipPath === "none")
+  .map((one) => `${one.tagName} ${one.className} ${one.textContent.slice(0, 40)}`)"""
+"""Elements whose content is wider than they are; 1 px for rounding. Headings for screen readers alone do not count."""
+
+
+@contextlib.contextmanager
+def opened(browser: Any, file: Path, width: int, scheme: str) -> Iterator[tuple[Any, list[str]]]:
+    """The page in a tab of its own with every `details` open and every chart drawn, and the problems so far.
+
+    Problems are messages of the console, errors, and requests for anything but the file and the data inside it.
+    """
+    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page.set_default_timeout(TIMEOUT_MS)
+    problems: list[str] = []
+    page.on("console", lambda message: problems.append(f"console: {message.text}"))
+    page.on("pageerror", lambda error: problems.append(f"error: {error}"))
+    inside = ("data:", "blob:", file.as_uri())
+    page.on("request", lambda one: problems.extend([] if one.url.startswith(inside) else [f"request: {one.url}"]))
+    try:
+        page.goto(file.as_uri())
+        settle(page)
+        yield page, problems
+    finally:
+        page.close()
+
+
+def settle(page: Any) -> None:
+    """Open everything, draw all charts, and wait for the player."""
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    page.evaluate("document.querySelectorAll('img').forEach((image) => { image.loading = 'eager'; })")
+    page.wait_for_function("[...document.images].every((image) => image.complete)")
+    for chart in page.locator("[data-chart]").all():
+        chart.scroll_into_view_if_needed()
+    page.wait_for_function("[...document.querySelectorAll('[data-chart]')].every((one) => one.dataset.drawn)")
+    page.wait_for_function("[...document.querySelectorAll('.player')].every((one) => one.dataset.ready === 'yes')")
+    page.evaluate("scrollTo(0, 0)")
+
+
+def wear(page: Any, width: int, scheme: str) -> None:
+    """Show an open page at another width, in light or dark."""
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": 900})
+    page.wait_for_timeout(150)  # charts follow the width and the colours
+
+
+def cut_off(page: Any) -> list[str]:
+    """Elements that do not fit, and charts wider than their place."""
+    charts = page.evaluate(
+        "[...document.querySelectorAll('[data-chart]')].filter((one) => one.scrollWidth > one.clientWidth + 1)"
+        ".map((one) => one.dataset.chart)"
+    )
+    return page.evaluate(CUT_OFF) + charts
+
+
+def axe_serious(page: Any) -> list[str]:
+    """Serious and critical faults that axe-core finds, each with the first element; needs axe-playwright-python."""
+    page.evaluate(Path(find_spec("axe_playwright_python").origin).with_name("axe.min.js").read_text(encoding="utf-8"))
+    audit = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
+    return [
+        f"{fault['id']}: {fault['help']}: {fault['nodes'][0]['html'][:200]}"
+        for fault in audit["violations"]
+        if fault["impact"] in SERIOUS
+    ]
+
 
 RUN = Run("dvc repro", {"seed": 1, "loss": {"mse": 1.0}}, {"seed": "1", "commit": "abc"})
 LOOKS = [(width, scheme) for width in (400, 800, 1400) for scheme in ("light", "dark")]
@@ -21,7 +96,7 @@ def browser():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium_path())
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         yield browser
         browser.close()
 

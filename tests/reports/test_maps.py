@@ -33,14 +33,11 @@ def test_the_papers_map_with_dolp_as_value_and_light_without_polarization():
     assert tuple(polarization_hsv(pixel(0.2), pixel(1), pixel(0))[0, 0]) == (51, 0, 0)
 
 
-def test_on_is_red_off_is_blue_and_no_event_is_white():
+def test_on_is_red_off_is_blue_and_full_scale_ignores_silent_and_hot_pixels():
     on, off, none = event_image(torch.tensor([[3.0, -3.0, 0.0]]), full_scale=3.0)[0].tolist()
     assert on[0] > max(on[1:])
     assert off[2] > max(off[:2])
     assert none == [255, 255, 255]
-
-
-def test_full_scale_ignores_pixels_without_events_and_a_hot_pixel():
     events = torch.zeros(1, 1, 10_000)
     events[0, 0, :1000] = -2.0
     events[0, 0, 5000] = 900.0
@@ -48,16 +45,13 @@ def test_full_scale_ignores_pixels_without_events_and_a_hot_pixel():
     assert event_full_scale(torch.zeros(4, 3, 3)) == 1.0
 
 
-def test_dolp_grows_lighter_everywhere_and_values_outside_their_range_are_clamped():
+def test_dolp_grows_lighter_values_are_clamped_and_a_picture_encodes_to_the_same_bytes():
     """Rec. 709 luminance of the colours rises: the map also reads in grey."""
     picture = dolp_image(torch.linspace(0, 1, 64)[None]).astype(float)
     assert (np.diff(picture[0] @ [0.2126, 0.7152, 0.0722]) > 0).all()
     values, clamped = torch.tensor([[-0.5, 1.5]]), torch.tensor([[0.0, 1.0]])
     assert (dolp_image(values) == dolp_image(clamped)).all()
     assert intensity_image(values)[0].tolist() == [[0, 0, 0], [255, 255, 255]]
-
-
-def test_a_picture_encodes_to_the_same_bytes_and_back():
     picture = np.arange(4 * 5 * 3, dtype=np.uint8).reshape(4, 5, 3)
     data = encode_png(picture)
     assert data == encode_png(picture.copy())

@@ -2,14 +2,17 @@ import dataclasses
 import json
 import re
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
+import torch
 
-from polarnet.reports.artefacts import Run
+from polarnet.reports.artefacts import Run, facts, read_results
 from polarnet.reports.legend import GENERAL
 from polarnet.reports.page import verdict, write_report, write_set_page
 from polarnet.reports.player import Film, Map, player_data
+from polarnet.storage.frames import FrameStore
 
 RUN = Run(
     "dvc repro",
@@ -30,14 +33,16 @@ def page(folder):
     return (folder / "index.html").read_text()
 
 
-def test_the_page_needs_no_other_file_and_no_network(page):
+def test_the_page_needs_no_other_file_names_no_other_network_and_has_no_warning(page):
     markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     sources = re.findall(r'(?<!xlink:)(?:src|srcset|href)="([^"]*)"', markup)
     assert all(source.startswith(("data:", "#")) for source in sources)
     assert not re.search(r"<script[^>]* src=|<link|@import|url\((?!#)", page.split("<script>")[0])
+    for absent in ("olarnet&#39;s own network", "<b>Ann</b>", 'class="warning"', "LPIPS ("):
+        assert absent not in page
 
 
-def test_one_sentence_says_how_good_ours_is_on_which_scenes_beside_the_best_other_method_and_the_oracle(page):
+def test_one_sentence_says_how_good_ours_is_beside_the_best_other_method_of_its_camera_and_the_oracle(page):
     lead = re.search(r'<p class="lead">(.*?)</p>', page)[1]
     assert re.fullmatch(
         r"The paper&#39;s network recovers DoLP with a mean squared error of 0\.0\d+ on 2 simulated scenes, 1 of them "
@@ -45,21 +50,22 @@ def test_one_sentence_says_how_good_ours_is_on_which_scenes_beside_the_best_othe
         r"the oracle mean, which needs the truth\.",
         lead,
     )
-
-
-def test_the_sentence_compares_with_no_row_of_another_camera():
     metrics = {name: {"mse": mse} for name, mse in (("rotating_polarizer", 0.01), ("cf", 0.1), ("ours", 0.05))}
     assert verdict(metrics, "3 scenes", GENERAL).endswith(
         "3 scenes: 50\xa0% lower than the best other method of this camera (CF)."
     )
 
 
-def test_the_first_table_has_the_scores_that_were_computed_and_the_best_is_marked(page):
+def test_the_first_table_has_the_computed_scores_and_the_papers_figures_are_told_from_them(page):
     first = re.search(r"<table.*?</table>", page, re.DOTALL)[0]
     scores = ["MSE ↓", "PSNR ↑", "SSIM ↑", "corr. ↑", "edges ↑", "AoLP err. ↓", "skill ↑", "ms / window ↓"]
     assert re.findall(r'scope="col">([^<]*)<', first) == ["Method", *scores]
     assert 'class="best"' in re.search(r'<tr class="m-ours">.*?</tr>', first, re.DOTALL)[0]
     assert '<th scope="row">E2V: FireNet</th>' in first
+    published = re.search(r'<aside class="published">.*?</aside>', page, re.DOTALL)[0]
+    assert all(text in published for text in ("Published figures of the paper, not of this run.", "15.56", "27.48"))
+    assert '<tr class="m-ours">' not in published
+    assert "15.56" not in page.replace(published, "")
 
 
 @pytest.mark.parametrize(
@@ -76,19 +82,7 @@ def test_the_page_shows_networks_parameters_as_in_params_yaml_and_escaped_text_o
     assert all(text in page for text in texts)
 
 
-def test_the_page_names_no_other_network_no_score_that_was_not_computed_and_has_no_warning(page):
-    for absent in ("olarnet&#39;s own network", "<b>Ann</b>", 'class="warning"', "LPIPS ("):
-        assert absent not in page
-
-
-def test_the_papers_figures_are_told_from_those_of_the_run(page):
-    published = re.search(r'<aside class="published">.*?</aside>', page, re.DOTALL)[0]
-    assert all(text in published for text in ("Published figures of the paper, not of this run.", "15.56", "27.48"))
-    assert '<tr class="m-ours">' not in published
-    assert "15.56" not in page.replace(published, "")
-
-
-def test_the_player_has_the_scenes_with_events_truth_and_the_methods_that_are_no_constants(page):
+def test_the_player_has_the_scenes_and_the_worst_ones_lead_to_it(page, folder):
     player = json.loads(re.search(r'data-role="data">(.*?)</script>', page)[1])
     for scene in player["scenes"]:
         kinds = {(one["source"], one["kind"]) for one in scene["maps"]}
@@ -98,9 +92,6 @@ def test_the_player_has_the_scenes_with_events_truth_and_the_methods_that_are_no
         }  # fmt: skip
     assert len(player["scenes"]) == 2
     assert player["scenes"][0]["name"].startswith("tree")  # photographs come before generated pictures
-
-
-def test_the_worst_scenes_lead_to_the_player_and_a_picture_and_the_papers_files_lie_beside_the_page(page, folder):
     assert sorted(re.findall(r'data-scene="([^"]*)"', page)) == ["leaf-00", "tree-00"]
     assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "paper"]
 
@@ -116,8 +107,10 @@ def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, t
     assert '<p class="lead">E2V: FireNet recovers DoLP' in page
 
 
-def test_the_same_artefacts_give_the_same_page(paths, page, tmp_path):
+def test_the_same_artefacts_give_the_same_page_and_a_log_shows_its_progress(paths, page, tmp_path, progress_log):
     assert write_report(paths, ["e2v"], RUN, tmp_path).read_text() == page
+    write_report(paths, ["e2v"], RUN, tmp_path / "report")
+    assert any(line.startswith("page: 100%") for line in progress_log())
 
 
 def test_a_further_test_set_has_its_table_and_its_pictures(paths, tmp_path):
@@ -158,6 +151,26 @@ def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(path
     assert "`" not in set_page.split("<main>")[1].split("<script")[0]
 
 
-def test_a_log_shows_the_progress_of_a_page(paths, tmp_path, progress_log):
-    write_report(paths, ["e2v"], RUN, tmp_path / "report")
-    assert any(line.startswith("page: 100%") for line in progress_log())
+def test_a_panel_holds_the_truth_of_the_window_it_names(data, paths):
+    for panel in read_results(paths.simulated).panels:
+        frames = FrameStore.open(data / "frames.zarr").frames(panel.sequence)
+        assert int(frames.t_us[panel.window + 1]) == panel.t_us
+        assert torch.equal(frames.dolp[panel.window + 1], panel.truth.dolp)
+        assert set(panel.predictions) == {"zeros", "oracle_mean", "e2v", "ours"}
+        assert [row for row, one in panel.predictions.items() if one.aolp is not None] == ["e2v"]
+
+
+def test_edited_code_is_said_but_what_the_pipeline_writes_is_no_edit(tmp_path):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+        subprocess.run(["git", *identity, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    for name in ("code.py", "dvc.lock"):
+        (tmp_path / name).write_text("1\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "one")
+    (tmp_path / "dvc.lock").write_text("2\n")
+    assert len(facts(tmp_path)["commit"]) == 40
+    (tmp_path / "code.py").write_text("2\n")
+    assert facts(tmp_path)["commit"].endswith(", with uncommitted changes")

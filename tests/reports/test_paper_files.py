@@ -7,13 +7,9 @@ import torch
 from polarnet.events.stream import Events
 from polarnet.reports.artefacts import read_results
 from polarnet.reports.legend import legend_of
-from polarnet.reports.maps import png
-from polarnet.reports.paper import Moment, comparison_figure, figure_11, score_line, write_paper_files
+from polarnet.reports.paper import Moment, figure_11, score_line, write_paper_files
 from polarnet.reports.recordings import draw_sequence
 from polarnet.storage.frames import Frames
-from polarnet.storage.panels import Panel, Shown, fraction_bytes
-
-TRUTH = torch.linspace(0, 1, 24 * 36).view(24, 36)
 
 
 @pytest.fixture
@@ -62,30 +58,9 @@ def test_figure_8_has_a_column_for_each_time_and_a_row_for_each_kind(tmp_path):
     assert height > 9 * one / 5
 
 
-def test_figure_11_says_when_and_of_how_many_events():
+def test_figure_11_says_when_and_of_how_many_events_and_a_frame_how_far_it_is_off():
     maps = torch.rand(12, 18)
     figure = figure_11([Moment(24_000, 79_191, maps, maps, maps), Moment(35_000, 100_000, maps, maps, maps)])
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[:2] == ["t = 24.0 ms, n = 79,191", "t = 35.0 ms, n = 100,000"]
-
-
-def scene(*methods):
-    film, times = fraction_bytes(TRUTH)[None], torch.tensor([33_333])
-    truth, half = (Shown(dolp, None, film, None) for dolp in (TRUTH, TRUTH / 2))
-    return Panel(
-        "tree", 0, 33_333, torch.zeros(4, 24, 36), TRUTH, times, film, film, truth, dict.fromkeys(methods, half)
-    )
-
-
-def test_a_comparison_grows_by_a_row_a_scene_and_a_column_a_method_without_constants():
-    def figure(*rows):
-        return comparison_figure(rows, rows[0].predictions)
-
-    one = figure(scene("ours"))
-    assert figure(*[scene("ours")] * 2).get_figheight() > 1.5 * one.get_figheight()
-    assert figure(scene("cf", "ours")).get_figwidth() > 1.2 * one.get_figwidth()
-    assert png(one) == png(figure(scene("zeros", "oracle_mean", "ours")))
-
-
-def test_a_frame_that_is_off_by_a_tenth_everywhere_scores_an_mse_of_a_hundredth_and_20_db():
     assert score_line(torch.full((8, 8), 0.6), torch.full((8, 8), 0.5)) == "0.0100 · 20.00 dB"

@@ -1,6 +1,12 @@
-import math
+import re
 
-from polarnet.reports.tables import COLUMNS, PAPER_TABLE_2, paper_table, score_table
+import pytest
+
+from polarnet.reports.charts import error_chart, event_budget_figure, reliability_chart, sweep_chart
+from polarnet.reports.figures import svg
+from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of
+from polarnet.reports.maps import png
+from polarnet.reports.tables import COLUMNS, score_table
 
 SCORES = {
     "ours": {"mse": 0.02, "psnr": 17.0, "ssim": 0.4, "lpips": None, "corr": 0.6, "ms_per_window": 19.04},
@@ -13,21 +19,19 @@ def row(table, method):
     return next(row for row in table.rows if row.method == method)
 
 
-def test_methods_keep_one_order_and_one_without_a_name_follows_under_its_own_key():
+def test_methods_keep_one_order_and_what_rounds_to_zero_has_no_sign():
     assert [r.method for r in score_table(SCORES).rows] == ["zeros", "cf", "ours"]
     table = score_table({"e2vid_official": {"mse": 0.1}, "zeros": {"mse": 0.2}})
     assert [r.label for r in table.rows] == ["zeros", "e2vid_official"]
+    assert [COLUMNS["skill"].printed(value) for value in (-0.0001, -0.0006)] == ["0.000", "-0.001"]
 
 
-def test_values_that_read_the_same_are_bold_together_and_the_fastest_method_is_not_because_speed_is_no_score():
+def test_the_best_values_are_bold_but_not_speed_and_no_row_of_another_camera():
     table = score_table({"cf": {"psnr": 12.001}, "ours": {"psnr": 12.004}})
     assert [r.cells[0].best for r in table.rows] == [True, True]
     table = score_table(SCORES)
     assert table.headings[-1] == "ms / window ↓"
     assert not any(r.cells[-1].best for r in table.rows)
-
-
-def test_a_row_of_another_camera_is_never_bold_and_a_note_says_why():
     table = score_table({"rotating_polarizer": {"mse": 0.01}, "cf": {"mse": 0.3}, "ours": {"mse": 0.02}})
     assert not row(table, "rotating_polarizer").cells[0].best
     assert row(table, "ours").cells[0].best
@@ -44,13 +48,69 @@ def test_lpips_names_its_backbone_in_heading_and_caption():
     assert score_table(scores, {"mse": COLUMNS["mse"]}).notes == ()
 
 
-def test_what_rounds_to_zero_has_no_sign():
-    assert [COLUMNS["skill"].printed(value) for value in (-0.0001, -0.0006)] == ["0.000", "-0.001"]
+def weights(**networks):
+    return {row: {"file": "best.safetensors", "sha256": "0" * 64, "network": name} for row, name in networks.items()}
 
 
-def test_the_papers_figures_agree_with_each_other():
-    """Its network is best, and -10 log10(MSE) bounds the mean PSNR from below (Jensen)."""
-    for experiment, methods in PAPER_TABLE_2.items():
-        assert all(cell.best for cell in row(paper_table(experiment), "paper").cells)
-        assert set(methods) == {"cf", "e2v", "paper"}
-        assert all(scores["psnr"] >= -10 * math.log10(scores["mse"]) - 0.01 for scores in methods.values())
+@pytest.mark.parametrize(
+    ("row", "section", "network", "label"),
+    [
+        ("ours", "ours", "polarnet", "ours: polarnet's network"),
+        ("ours", "ours", "paper", "ours: the paper's network"),
+        ("e2v", "e2v", "e2vid", "E2V: E2VID"),
+        ("e2v+gain", "e2v", "e2vid", "E2V: E2VID, gains solved"),
+        ("paper", "paper", "paper", "the paper's network"),
+        ("paper", "paper", "polarnet", "second network: polarnet's network"),
+    ],
+)
+def test_a_row_is_named_and_coloured_after_the_network_behind_it(row, section, network, label):
+    legend = legend_of(weights(**{section: network}))
+    assert (legend.label(row), legend.colour(row)) == (label, NETWORKS[network].colour)
+
+
+def test_the_glossary_has_the_rows_of_the_table_and_no_other():
+    entries = dict(glossary(["cf", "cf+gain", "ours"], legend_of(weights(ours="paper"))))
+    assert list(entries) == ["CF", "ours: the paper's network", "gains solved"]
+    assert "gains solved" not in dict(glossary(["cf"], GENERAL))
+
+
+METRICS = {"oracle_mean": {"mse": 0.03, "mse_ci": [0.02, 0.04]}, "ours": {"mse": 0.02, "mse_ci": [0.01, 0.03]}}
+
+
+def lines(axes):
+    """Points of each line, as pairs."""
+    return [list(zip(*line.get_data(), strict=True)) for line in axes.lines]
+
+
+def test_a_method_or_a_point_of_a_sweep_is_a_dot_on_its_interval():
+    (axes,) = error_chart(METRICS, GENERAL).axes
+    assert lines(axes)[2:] == [[(0.01, 1), (0.03, 1)], [(0.02, 1)]]
+    assert axes.get_yticklabels()[0].get_text() == "oracle mean"
+    (axes,) = sweep_chart({"loss.ssim=0.0": (0.5, 0.25)}).axes
+    assert lines(axes) == [[(0.25, 0), (0.75, 0)], [(0.5, 0)]]
+
+
+@pytest.mark.parametrize("figure", [
+    lambda: error_chart(METRICS, GENERAL),
+    lambda: reliability_chart({"ours": [[0.01, 0.02, 100], [0.1, 0.1, 300]]}, GENERAL),
+])  # fmt: skip
+def test_a_drawing_takes_its_colours_from_the_page_and_has_the_same_bytes_each_time(figure):
+    drawing = svg(figure())
+    assert drawing == svg(figure())
+    colours = set(re.findall(r"var\(--\w+\)", drawing))
+    assert {"var(--text)", "var(--quiet)", "var(--line)"} >= colours > {"var(--quiet)"}
+    assert "#00000" not in drawing
+    assert "<text" in drawing
+    assert all(name.startswith(("p", "m")) for name in re.findall(r' id="(\w+)"', drawing))  # clips and markers
+
+
+def test_the_event_budget_marks_the_papers_answer_and_has_the_same_bytes_each_time():
+    scores = {"psnr": 10.3, "corr": 0.3}
+    results = {
+        "since_start": {"cf": [{"events_per_pixel": x, **scores} for x in (0.2, 1.1, 4.0)]},
+        "window_length": {"cf": [{"window_us": x, **scores} for x in (5000, 33333)]},
+    }
+    figure = event_budget_figure(results)
+    assert any(line.get_linestyle() == "--" and line.get_xdata()[0] == 1.04 for line in figure.axes[0].lines)
+    assert lines(figure.axes[1]) == [[(5.0, 10.3), (33.333, 10.3)]]
+    assert png(figure) == png(event_budget_figure(results))

@@ -6,13 +6,10 @@ from polarnet.cli import main
 from polarnet.reports.viewing import films_of
 
 
-def test_a_folder_gives_events_and_truth_of_a_sequence_in_one_film(data):
+def test_a_folder_a_recovery_and_a_recording_are_films_with_their_times(data, tmp_path):
     films = {film.name: film for film in films_of(data)}
     assert {one.kind for one in films["tree-00"].maps} == {"events", "s0", "dolp", "aolp"}
     assert {one.kind for one in films["tree-00: scene"].maps} == {"s0", "dolp", "aolp"}
-
-
-def test_a_recovery_is_a_film_of_its_dolp_and_aolp(tmp_path):
     group = zarr.open_group(tmp_path / "night" / "recovered.zarr", mode="w")
     group["t_us"] = np.array([33_000, 66_000])
     for name in ("dolp", "aolp"):
@@ -20,6 +17,9 @@ def test_a_recovery_is_a_film_of_its_dolp_and_aolp(tmp_path):
     (film,) = films_of(tmp_path / "night")
     assert film.t_us == [33_000, 66_000]
     assert {one.kind for one in film.maps} == {"dolp", "aolp"}
+    (tmp_path / "night.txt").write_text("40 30\n913000000 3 2 1\n913000240 4 2 1\n")
+    (film,) = films_of(tmp_path / "night.txt")
+    assert (film.t_us[0], film.t_us[-1]) == (10, 241)
 
 
 def test_the_command_opens_the_page_that_a_recovery_has(tmp_path, monkeypatch, capsys):
@@ -32,12 +32,6 @@ def test_the_command_opens_the_page_that_a_recovery_has(tmp_path, monkeypatch, c
     assert not (tmp_path / "outputs").exists()
     assert main(["view", str(tmp_path), "--sequence", "lake"]) == 1
     assert "a folder with a page: expected no --sequence" in capsys.readouterr().err
-
-
-def test_times_of_a_recording_count_from_its_first_event(tmp_path):
-    (tmp_path / "night.txt").write_text("40 30\n913000000 3 2 1\n913000240 4 2 1\n")
-    (film,) = films_of(tmp_path / "night.txt")
-    assert (film.t_us[0], film.t_us[-1]) == (10, 241)
 
 
 @pytest.mark.parametrize(("name", "message"), [("", "found none"), ("nowhere", "no such path")])

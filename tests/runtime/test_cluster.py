@@ -13,7 +13,7 @@ import pytest
 from preloaded import FORKSERVER
 
 from polarnet.runtime.cluster import pmap
-from polarnet.terminal.progress import ProgressBar, steps
+from polarnet.terminal.progress import ProgressBar, said_after, steps
 
 
 def square(value: int) -> int:
@@ -131,9 +131,10 @@ def cluster():
         yield cluster
 
 
-def test_a_dask_cluster_gives_the_same_results(cluster):
-    results = pmap(square, [3, 1, 2], workers=1, label="squares", address=cluster.scheduler_address)
-    assert results == [9, 1, 4]
+def test_a_dask_cluster_gives_the_same_results_and_loses_nothing_with_a_killed_worker(cluster, tmp_path):
+    items = [(str(tmp_path / "died"), value) for value in range(6)]
+    assert pmap(die_once, items, workers=1, label="values", address=cluster.scheduler_address) == list(range(6))
+    assert (tmp_path / "died").exists()
 
 
 def test_a_dask_scheduler_that_ends_is_an_error(cluster, tmp_path):
@@ -155,3 +156,11 @@ def test_without_semaphores_the_message_says_where_and_what_helps(monkeypatch):
     monkeypatch.setattr("polarnet.runtime.cluster.ProcessPoolExecutor", refuse)
     with pytest.raises(RuntimeError, match=r"/dev/shm.+Read-only file system.+runtime.workers=1"):
         pmap(str, [1, 2], workers=2, label="numbers")
+
+
+def test_a_message_explains_long_work_and_stays_away_from_short_work(capsys):
+    with said_after(60.0, "short"):
+        pass
+    with said_after(0.0, "long"):
+        time.sleep(0.5)
+    assert capsys.readouterr().err == "long\n"

@@ -47,11 +47,8 @@ def sealed(tmp_path):
     return tmp_path
 
 
-def test_the_checksums_of_a_folder_are_those_of_coreutils(sealed):
+def test_the_checksums_of_a_folder_are_those_of_coreutils_and_changed_and_missing_files_are_named(sealed):
     assert subprocess.run(["sha256sum", "--check", "--strict", SUMS], cwd=sealed, capture_output=True).returncode == 0
-
-
-def test_a_changed_and_a_missing_file_are_named(sealed):
     (sealed / "a").write_text("other")
     (sealed / "below" / "b").unlink()
     changed, missing = changed_files(sealed)
@@ -113,13 +110,6 @@ def test_a_published_folder_is_the_old_one_or_the_new_one_whenever_the_process_d
     assert deaths == (1 if exchange else 2)
     assert (tmp_path / "out" / "a").read_text() == "out.partial"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out.old"]
-
-
-def test_a_copy_that_a_user_put_aside_as_old_is_no_result_of_a_killed_process(tmp_path):
-    (tmp_path / "out.old").mkdir()
-    with claimed(tmp_path / "out"):
-        assert not (tmp_path / "out").exists()
-    assert (tmp_path / "out.old").exists()
 
 
 def test_a_temporary_file_that_is_a_link_changes_no_file_elsewhere_and_two_do_not_write_one_file(tmp_path):

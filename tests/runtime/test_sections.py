@@ -4,7 +4,7 @@ from typing import Annotated
 import pytest
 from pydantic import Field, NonNegativeInt, PositiveFloat
 
-from polarnet.runtime.sections import one_of, section, unknown_key
+from polarnet.runtime.sections import one_of, section
 
 
 @section
@@ -40,6 +40,7 @@ def test_values_at_their_limits_pass_and_become_the_declared_types():
         ({"rate_hz": 0.0}, "rate_hz: expected > 0, got 0.0"),
         ({"rate_hz": float("nan")}, "rate_hz: expected a number from -1e+10 to 1e+10, got nan"),
         ({"sides": [2, 10]}, "sides[1]: expected <= 9, got 10"),
+        ({"sides": [2, 1e30]}, "sides[1]: expected a number from -1e+10 to 1e+10, got 1e+30"),
         ({"sides": [2]}, "sides: expected at least 2 values, got [2]"),
         ({"leak": "many"}, "leak: expected a valid integer, got 'many'"),
         ({"leak": 3}, "leak: expected at most the first side 2, got 3"),
@@ -65,25 +66,3 @@ def test_a_section_cannot_be_changed_and_a_replaced_value_is_checked_too():
         Lens(4.0, "none").focal_mm = 5.0
     with pytest.raises(ValueError, match=r"^focal_mm: expected > 0, got -1$"):
         dataclasses.replace(Lens(4.0, "none"), focal_mm=-1)
-
-
-def test_an_unknown_key_comes_with_the_keys_to_choose_from():
-    assert unknown_key(Camera, ["lenses", "tele", "focal_mm"]) is None
-    assert unknown_key(Camera, ["leak", "x"]) == "leak.x is not a setting; leak is a value, not a section"
-
-
-@pytest.mark.parametrize("number", [1e30, -(10**12), float("nan")])
-def test_numbers_that_no_setting_can_have_are_refused_wherever_they_are(number):
-    @section
-    class Inner:
-        text: str
-        numbers: list[float]
-
-    @section
-    class Outer:
-        inner: Inner
-
-    with pytest.raises(ValueError, match=r"inner\.numbers\[1\]: expected a number from -1e\+10 to 1e\+10, got"):
-        Outer(inner={"text": "a", "numbers": [1.0, number]})
-    with pytest.raises(ValueError, match=r"inner\.text: expected a number from"):
-        Outer(inner={"text": number, "numbers": []})

@@ -29,10 +29,6 @@ def places_of(events) -> np.ndarray:
     return np.asarray(events.y).astype(int) * 1000 + np.asarray(events.x)
 
 
-def rows_of(events, which) -> list[list[int]]:
-    return [getattr(events, name)[which].tolist() for name in "txyp"]
-
-
 def test_hot_pixels_have_the_configured_share_and_are_poisson_processes_of_either_polarity():
     columns = constant(dataclasses.replace(QUIET, hot_pixel_share=0.02, hot_pixel_rate_hz=20.0), 100.0, 10.0)
     pixel = columns.y.astype(int) * SIDE + columns.x
@@ -48,20 +44,6 @@ def test_hot_pixels_have_the_configured_share_and_are_poisson_processes_of_eithe
     counts = np.bincount(np.unique(pixel, return_inverse=True)[1])
     assert stats.kstest((columns.t % (1 << 16)) / (1 << 16), "uniform").pvalue > 0.001
     assert counts.var() == pytest.approx(200, rel=0.35)  # equal to the mean
-
-
-@pytest.mark.parametrize("model", list(MODELS))
-def test_hot_pixels_fire_whatever_the_light_and_the_model(model):
-    config = dataclasses.replace(QUIET, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0)
-    dark, still = constant(config, 1.0, 0.5), constant(config, 240.0, 0.5)
-    assert np.array_equal(dark.t, still.t)
-    frames, t_us = moving_bars(2), 3333 * torch.arange(12)
-    moving, _ = emulate(frames, t_us, dataclasses.replace(config, model=model), key=7)
-    at_rest, _ = emulate(frames[:1].expand_as(frames), t_us, dataclasses.replace(config, model=model), key=7)
-    for channel, hot in zip(moving, at_rest, strict=True):
-        their_own = torch.from_numpy(np.isin(places_of(channel), places_of(hot)))
-        assert len(hot)
-        assert rows_of(channel, their_own) == rows_of(hot, slice(None))  # their light is unseen
 
 
 @pytest.mark.parametrize("model", list(MODELS))

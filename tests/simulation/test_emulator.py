@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 import torch
 from event_fixtures import equal
-from simulation_fixtures import QUIET, moving_bars
+from simulation_fixtures import QUIET, REST, STILL, moving_bars
 
 from polarnet.events.stream import concatenate, validate
+from polarnet.simulation import PolarizationScene, Trajectory, emulate_motion
+from polarnet.simulation.camera import Camera, grid
 from polarnet.simulation.emulator import MODELS, Channels, EmulatorConfig, emulate, emulate_frames
+from polarnet.simulation.pixels.columns import MAX_STEP_US
 from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 
 NOISY = dataclasses.replace(
     QUIET, contrast_threshold_sigma_on=0.03, contrast_threshold_sigma_off=0.03, cutoff_hz=100.0, leak_rate_hz=2.0,
@@ -46,9 +50,7 @@ def test_events_of_a_log_ramp_are_stamped_where_it_crosses_the_thresholds(model)
 
 @pytest.mark.parametrize(("model", "tolerance_us"), [("exact", 5), ("v2e", 60)])
 @pytest.mark.parametrize("cutoff_hz", [50.0, 0.0])
-def test_photoreceptor_and_source_follower_answer_a_step_of_light_like_a_second_order_low_pass(
-    model, tolerance_us, cutoff_hz
-):
+def test_photoreceptor_and_source_follower_are_a_second_order_low_pass(model, tolerance_us, cutoff_hz):
     every_us, rate = 20, 2 * math.pi * 50
     t_us = np.append(0, 1 + every_us * np.arange(1500))
     frames = np.full((len(t_us), 1, 1, 1), 255.0, np.float32)
@@ -62,15 +64,12 @@ def test_photoreceptor_and_source_follower_answer_a_step_of_light_like_a_second_
     assert events.t[:10].numpy() == pytest.approx(expected_us, abs=tolerance_us)
 
 
-def test_v2e_spreads_events_over_a_step_as_its_busiest_pixel_asks():
+def test_v2e_spreads_events_over_a_step_and_does_not_consume_what_its_refractory_period_suppresses():
     frames = torch.tensor([[math.exp(4.0), math.exp(4.0)], [math.exp(4.61), math.exp(4.21)]]).float().view(2, 1, 1, 2)
     (events,), _ = emulate(frames, torch.tensor([0, 3000]), of("v2e"), key=1)
     # three events of the first pixel at thirds; the second pixel's only event shares the first slot
     assert events.t.tolist() == [1000, 1000, 2000, 3000]
     assert events.x.tolist() == [0, 1, 0, 0]
-
-
-def test_v2e_does_not_consume_what_its_refractory_period_suppresses():
     frames = torch.tensor([4.0, 4.61, 4.61]).exp().float().view(3, 1, 1, 1)
     (events,), _ = emulate(frames, torch.tensor([0, 3000, 6000]), of("v2e", refractory_period_us=2500.0), key=1)
     # slots at 1, 2, 3 ms: only the first is taken; two thresholds remain, tried again at 4.5 and 6 ms
@@ -88,16 +87,6 @@ def test_exact_fires_a_delayed_event_when_the_refractory_period_ends_unless_the_
     (events,), _ = emulate(frames, torch.tensor([0, 4100, 6100]), of("exact", refractory_period_us=4000.0), key=1)
     # crossings at 2 and 4 ms; at 6 ms, when the second may fire, only 0.22 - 0.2 of change is left
     assert events.t.tolist() == pytest.approx([2000], abs=1)
-
-
-@pytest.mark.parametrize("cutoff_hz", [0.5, 3.0, 40.0, 880.0])
-def test_the_photoreceptor_of_exact_follows_a_step_of_light_within_a_frame(cutoff_hz):
-    """Over a step, with a = bandwidth * duration, a rise of the response by r becomes r (1 - (1 - exp(-a)) / a)."""
-    frames = torch.tensor([100.0, 255.0]).view(2, 1, 1, 1)
-    config = of("exact", cutoff_hz=cutoff_hz, contrast_threshold_on=5.0, contrast_threshold_off=5.0)
-    _, state = emulate(frames, torch.tensor([0, 20_000]), config, key=1)
-    a = 2 * math.pi * cutoff_hz * 0.02 * (177.5 + 20) / 275
-    assert float(state.pixels[0].change[0]) == pytest.approx(math.log(2.55) * (1 + math.expm1(-a) / a), rel=1e-5)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
@@ -155,16 +144,6 @@ def test_on_and_off_thresholds_have_deviations_of_their_own_and_the_configured_c
     assert abs(across) < 3 / 100  # another channel is another sensor
 
 
-@pytest.mark.parametrize("model", ["v2e", "exact"])
-def test_another_key_is_another_sensor_and_the_same_key_the_same(model):
-    frames, t_us = moving_bars(), 3333 * torch.arange(12)
-    (first, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
-    (again, *_), _ = emulate(frames, t_us, of(model, NOISY), key=2**64 - 1)
-    (other, *_), _ = emulate(frames, t_us, of(model, NOISY), key=1)
-    assert equal(first, again)
-    assert not equal(first, other)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -191,6 +170,7 @@ CLIP, TIMES = torch.full((3, 2, 4, 5), 100.0), torch.tensor([0, 10, 20])
     [
         (CLIP, torch.tensor([0, 10, 10]), "strictly increasing times"),
         (CLIP, torch.tensor([0.0, 10.0, float("nan")], dtype=torch.float64), "strictly increasing times"),
+        (CLIP[:2], torch.tensor([2.0**54, 2.0**54 + 8], dtype=torch.float64), r"times in us, of at most 2\^53"),
         (CLIP, TIMES[:2], r"one time each .* got frames \(3, 2, 4, 5\) and 2 times"),
         (CLIP[:0], TIMES[:0], "at least one frame"),
         (CLIP.to(torch.int64), TIMES, "uint8 or float digital numbers .* got torch.int64"),
@@ -215,17 +195,6 @@ def test_a_state_goes_on_with_its_own_sensor_and_later_times_alone():
         emulate(CLIP, TIMES + 100, of("v2e"), key=1, state=state)
     with pytest.raises(ValueError, match="2 different channel numbers"):
         emulate(CLIP, TIMES, QUIET, key=1, channels=[1, 1])
-
-
-@pytest.mark.parametrize(("of_the_ramp", "levels"), [(np.float32, 1), (np.uint8, 3)])
-def test_the_steps_of_8_bits_fire_events_in_groups_and_floats_one_at_a_time(of_the_ramp, levels):
-    """Below 20 DN a step of one DN is ln(20) / 20 = 0.15, three thresholds of 0.05: ten steps from 10 to 20 DN."""
-    ramp = 10 * np.exp(np.linspace(0, math.log(4), 401))
-    light = (np.rint(ramp) if levels > 1 else ramp).astype(of_the_ramp)[:, None, None, None]
-    config = of("exact", contrast_threshold_on=0.05, contrast_threshold_off=0.05)
-    (events,), _ = emulate(light, 5000 * np.arange(401), config, key=1)
-    steps = events.t[events.t < 5000 * (ramp < 19.5).sum()] // (5000 if levels > 1 else 1)
-    assert steps.unique(return_counts=True)[1].float().mean() == pytest.approx(levels, abs=0.4)
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])
@@ -256,7 +225,7 @@ def test_with_dark_dn_a_step_by_a_factor_fires_alike_over_six_decades_of_light(m
     assert equal(again, events)
 
 
-def test_a_pixel_held_in_reset_forgets_the_change_of_its_refractory_period():
+def test_a_pixel_held_in_reset_forgets_the_change_and_the_leak_of_its_refractory_period():
     """A ramp of 1.0 in 1 ms crosses 0.2 at 200 us, is forgotten until 700 us, and crosses again at 900 us."""
     frames = log_ramp(4.0, 5.0, 1).repeat_interleave(torch.tensor([1, 2]), 0)
     t_us = np.array([0.0, 1000.0, 5000.0])
@@ -264,19 +233,6 @@ def test_a_pixel_held_in_reset_forgets_the_change_of_its_refractory_period():
         config = of("exact", refractory_period_us=500.0, refractory=refractory)
         (events,), _ = emulate(frames, t_us, config, key=1)
         assert events.t.tolist()[:4] == pytest.approx(expected, abs=1)
-
-
-@pytest.mark.parametrize("rate_hz", [100.0, 3000.0])
-def test_a_pixel_held_in_reset_fires_the_same_at_any_frame_rate(rate_hz):
-    """On an endless log ramp of 1.0 in 100 ms, an event every refractory period and the time of a threshold: 32 ms."""
-    t_us = np.arange(0, 300_001, 1e6 / rate_hz)
-    frames = np.exp(2.5 + t_us / 1e5).astype(np.float32).reshape(-1, 1, 1, 1)
-    config = of("exact", knee_dn=2.72, refractory_period_us=12_000.0, refractory="reset")
-    (events,), _ = emulate(frames, t_us, config, key=1)
-    assert events.t.tolist() == pytest.approx(20_000 + 32_000 * np.arange(9), abs=20)
-
-
-def test_a_leak_of_a_pixel_held_in_reset_starts_anew_after_each_period():
     config = of("exact", leak_rate_hz=10.0, refractory_period_us=150_000.0, refractory="reset")
     (events,), _ = emulate(torch.full((101, 1, 1, 1), 90.0), 100_000 * np.arange(101), config, key=1)
     assert events.t.diff().tolist() == pytest.approx([250_000] * (len(events) - 1), abs=2)
@@ -293,3 +249,54 @@ def test_presets_of_real_cameras_fire_signal_and_noise_over_six_decades(name):
     dark, dim, bright = torch.bincount(events.x.long() // 400, minlength=3).tolist()
     assert dim == pytest.approx(bright, rel=0.15)
     assert 0 < dark < 0.2 * dim
+
+
+STEP = torch.tensor([50.0, 200.0]).view(2, 1, 1, 1).expand(2, 1, 3, 3)
+MODEL_NAMES = pytest.mark.parametrize("model", list(MODELS))
+
+
+@MODEL_NAMES
+@pytest.mark.parametrize("start_us", [0.0, -5e6, 2.0**31 - 1e6, 2.0**51])
+def test_a_step_of_71_minutes_has_its_events_within_it_and_a_longer_one_is_refused(model, start_us):
+    config = of(model, refractory_period_us=500.0)
+    t_us = torch.tensor([start_us, start_us + MAX_STEP_US], dtype=torch.float64)
+    (events,), state = emulate(STEP, t_us, config, key=1)
+    assert len(validate(events)) >= 9 * 5
+    assert events.t.min() >= start_us
+    assert events.t.max() <= start_us + MAX_STEP_US
+    with pytest.raises(ValueError, match=r"at most 4295 s from one frame to the next, got 5000 s .* insert frames"):
+        emulate(STEP, torch.tensor([start_us, start_us + 5e9], dtype=torch.float64), config, key=1)
+    with pytest.raises(ValueError, match="at most 4295 s from one frame to the next"):  # after a pause of a live camera
+        emulate(STEP[:1], t_us[1:] + 5e9, config, key=1, state=state)
+
+
+@MODEL_NAMES
+def test_a_rotating_and_a_moving_sensor_refuse_long_steps_too(model):
+    scene, rest = PolarizationScene(torch.full((3, 8, 8), 0.1)), Trajectory(3.5, 3.5, REST, REST, STILL, STILL, 0.0)
+    config = of(model, render_rate_hz=2e-4)
+    with pytest.raises(ValueError, match="from one frame to the next, got 5000 s"):
+        emulate_motion(Camera(config, key=1), scene, rest, 5_000_000_000, (4, 4))
+    slow = RotatingConfig(rate_hz=1e-6, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=32)
+    with pytest.raises(ValueError, match="from one frame to the next, got 5000 s"):
+        emulate_rotating(slow, Camera(config, key=1), scene, rest, 5_000_000_000, grid("four_sensors", 4, 4))
+
+
+@pytest.mark.parametrize("model", ["v2e", "exact"])
+def test_a_pixel_can_fire_a_million_times_in_one_step(model):
+    config = of(model, leak_rate_hz=1e4, contrast_threshold_on=0.01)
+    (events,), _ = emulate(STEP[:1, :, :1, :1].expand(2, 1, 1, 1), np.array([0.0, 1e8]), config, key=1)
+    assert len(validate(events)) == pytest.approx(1e6, rel=1e-3)
+    assert int(events.t.max()) <= 1e8
+
+
+def test_shot_noise_goes_on_since_1970_and_v2es_refractory_period_holds_at_negative_times():
+    """There float64 resolves quarters of a microsecond: a shorter wait would draw the same wait again, without end."""
+    config, start_us = of("exact", shot_noise_rate_hz=1e5, refractory_period_us=100.0), 1.76e15
+    pieces, state = [], None
+    for k in range(3):
+        (events,), state = emulate(STEP[:1], np.array([start_us + 1e5 * k]), config, key=1, state=state)
+        pieces.append(events)
+    assert len(concatenate(pieces)) > 9 * 1000
+    config = of("v2e", refractory_period_us=500.0)
+    late, early = (emulate(STEP, np.array([t, t + 1e4]), config, key=1)[0][0] for t in (0.0, -1e6))
+    assert (early.t + 1_000_000).tolist() == late.t.tolist()

@@ -11,7 +11,7 @@ from scipy import stats
 from simulation_fixtures import QUIET
 
 from polarnet.simulation.emulator import EmulatorConfig, emulate
-from polarnet.simulation.pixels.randomness import mixed, normal, normal_map, rough_normals, uniform
+from polarnet.simulation.pixels.randomness import normal, normal_map
 
 SIDE = 64  # pixels
 
@@ -66,18 +66,6 @@ def test_thresholds_tilt_shot_noise_towards_the_lower_one():
         assert int((events.p == 1).sum()) == pytest.approx(expected, abs=3 * math.sqrt(expected))
 
 
-@pytest.mark.parametrize("fps", [30, 300])
-def test_leak_of_v2e_has_its_rate_and_a_jitter_that_shrinks_with_the_frame_rate(fps):
-    columns = still(dataclasses.replace(QUIET, model="v2e", leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
-    intervals, first = intervals_s(columns)
-    assert (columns.p == 1).all()
-    # the jitter of the frames adds up to 0.1 sqrt(dt / R); events are stamped at frames
-    spread = math.sqrt(0.01 / fps + 1 / 6 / fps**2)
-    assert intervals.mean() == pytest.approx(1.0, abs=4 * spread / math.sqrt(len(intervals)) + 0.1 / fps)
-    assert intervals.std() == pytest.approx(spread, rel=0.2)
-    assert first.min() > 0.85  # all pixels start in step: v2e knows no phase
-
-
 @pytest.mark.parametrize("fps", [20, 300])
 def test_leak_of_exact_has_its_rate_a_random_phase_and_the_same_jitter_at_any_frame_rate(fps):
     columns = still(dataclasses.replace(QUIET, leak_rate_hz=1.0, leak_jitter=0.1), 100.0, 5.0, fps)
@@ -99,40 +87,10 @@ def test_leak_of_exact_is_the_same_event_for_event_at_any_frame_rate():
     assert np.sort(between_slow) == pytest.approx(np.sort(between_fast), abs=1e-4)
 
 
-def test_uniform_numbers_are_uniform_and_neighbours_are_independent():
-    key = np.uint64(12)
-    values = np.array([uniform(np.uint64(mixed(key, i))) for i in range(20_000)])
-    assert stats.kstest(values, "uniform").pvalue > 0.01
-    assert abs(np.corrcoef(values[:-1], values[1:])[0, 1]) < 3 / math.sqrt(20_000)
-
-
 def test_the_normal_quantile_is_right_from_tail_to_tail():
     u = np.concatenate([10.0 ** -np.arange(1, 17), np.linspace(0.01, 0.99, 99), 1 - 10.0 ** -np.arange(1, 15)])
     assert [normal(x) for x in u] == pytest.approx(stats.norm.ppf(u), rel=3e-7, abs=3e-7)
     assert stats.kstest(normal_map(np.uint64(3), 1, 0, 20_000), "norm").pvalue > 0.01
-
-
-def test_rough_normal_numbers_have_the_moments_they_claim():
-    values = np.empty(200_001, np.float32)
-    rough_normals(np.uint64(4), 0, values)
-    assert values.mean() == pytest.approx(0, abs=3 / math.sqrt(200_000))
-    assert values.var() == pytest.approx(1, abs=3 * math.sqrt(2 / 200_000))
-    assert stats.kurtosis(values) == pytest.approx(-0.15, abs=0.04)
-    assert abs(values).max() <= 4.61
-    assert abs(np.corrcoef(values[:-1], values[1:])[0, 1]) < 3 / math.sqrt(200_000)
-
-
-@pytest.mark.parametrize("model", ["v2e", "exact"])
-@pytest.mark.parametrize("fps", [200, 1000])
-def test_the_photoreceptor_s_noise_has_its_deviation_and_spectrum_at_any_frame_rate(model, fps):
-    config = dataclasses.replace(QUIET, model=model, cutoff_hz=30.0, photoreceptor_noise=0.05)
-    t_us, frames = np.arange(fps + 1) * 1e6 / fps, torch.full((1, 1, SIDE, SIDE), 60.0)
-    _, state = emulate(frames.expand(fps + 1, -1, -1, -1), t_us, config, key=5)
-    before = state.pixels[0].noise
-    assert (before.mean(), before.std()) == pytest.approx((0, 0.05), abs=4 * 0.05 / SIDE)
-    _, state = emulate(frames, t_us[-1:] + 1e6 / fps, config, key=5, state=state)
-    kept = math.exp(-2 * math.pi * 30 / fps)
-    assert np.corrcoef(before, state.pixels[0].noise)[0, 1] == pytest.approx(kept, abs=4 / SIDE)
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])

@@ -8,11 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulation_fixtures import REST, STILL
+from simulation_fixtures import REST
 
+from polarnet.simulation import MOTIONS, PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.motion import Sine, SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
-from polarnet.simulation.presets import MOTIONS
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.stokes import aolp, dolp
 
 CONFIG = dataclasses.replace(MOTIONS["default"], sequences_per_picture=1, speed_min_px_s=60.0, speed_max_px_s=200.0)
@@ -72,17 +71,6 @@ def test_the_drawn_peak_speed_is_really_reached_within_the_sequence(seed):
     assert CONFIG.speed_min_px_s <= trajectory.speed_px_s <= CONFIG.speed_max_px_s
 
 
-def test_motion_is_mostly_drift_and_seldom_stops():
-    t_s = np.linspace(0, 1, 201)
-    relative = []
-    for seed in range(100):
-        trajectory = random_trajectory(CONFIG, 400, 600, np.random.default_rng(seed))
-        pose = trajectory.pose(t_s)
-        relative.append(np.hypot(np.diff(pose.x), np.diff(pose.y)) * 200 / trajectory.speed_px_s)
-    assert np.median(relative) > 0.7
-    assert np.percentile(relative, 1) > 0.1
-
-
 def test_a_trajectory_survives_the_way_through_its_vector_to_the_last_bit():
     config = dataclasses.replace(CONFIG, rotation_max_deg=10.0, zoom_max=1.5)
     trajectory = random_trajectory(config, 400, 600, np.random.default_rng(0))
@@ -91,16 +79,13 @@ def test_a_trajectory_survives_the_way_through_its_vector_to_the_last_bit():
         Trajectory.from_vector(np.zeros(5))
 
 
-def test_a_scene_too_small_for_the_window_is_refused():
+def test_a_scene_too_small_for_the_window_is_refused_and_a_small_one_lowers_the_speed():
     with pytest.raises(ValueError, match=r"scene of 120x300 .* too small: a sensor of 120x180 .* more than 120x180"):
         random_trajectory(CONFIG, 120, 300, np.random.default_rng(0))
     rolled = dataclasses.replace(CONFIG, rotation_max_deg=90.0)
     with pytest.raises(ValueError, match="more than 216x216"):  # the sensor's diagonal
         random_trajectory(rolled, 215, 600, np.random.default_rng(0))
-
-
-def test_speed_is_lowered_to_what_a_small_scene_allows():
-    """With 20 pixels of room and 800 px/s^2, sqrt(800 * 20 / 2) = 126 px/s is about the most."""
+    # With 20 pixels of room and 800 px/s^2, sqrt(800 * 20 / 2) = 126 px/s is about the most.
     speeds = [random_trajectory(CONFIG, 140, 200, np.random.default_rng(seed)).speed_px_s for seed in range(50)]
     assert min(speeds) >= 60
     assert max(speeds) < 150
@@ -128,28 +113,12 @@ def test_a_bad_setting_is_refused_by_name(changes, message):
 # -- what the window sees ----------------------------------------------------------------------------------------------
 
 
-def test_a_window_at_whole_pixels_sees_exactly_those_pixels(scene):
+def test_a_window_at_whole_pixels_sees_exactly_those_pixels_and_with_zoom_2_every_second_is_one(scene):
     for top, left in ((0, 0), (7, 11), (40, 50)):
         frame = render(scene, still(left + 29 / 2, top + 19 / 2), np.zeros(1), 20, 30)[0]
         assert torch.equal(frame, scene.stokes[:, top : top + 20, left : left + 30])
-
-
-def test_a_motion_by_whole_pixels_is_an_exact_shift(scene):
-    swing = Sine(8.0, math.pi / 2, 0.0)  # 0, 8, 0, -8 pixels after 0, 1, 2, 3 seconds
-    trajectory = Trajectory(40 + 0.5, 30 + 0.5, (swing, STILL, STILL), REST, STILL, STILL, 13.0)
-    first, second, *_ = render(scene, trajectory, np.arange(2.0), 20, 30)
-    assert torch.equal(first[..., 8:], second[..., :-8])
-
-
-def test_a_quarter_turn_of_the_camera_turns_picture_and_polarization(scene):
-    """Rolled by +90 degrees (x axis towards y, down), window column c looks down along the scene's rows."""
-    side = 21
-    frame = render(scene, still(40.0, 30.0, roll=math.pi / 2), np.zeros(1), side, side)[0]
-    patch = scene.stokes[:, 20:41, 30:51]
-    turned = torch.rot90(patch, 1, dims=(1, 2))
-    torch.testing.assert_close(frame[0], turned[0], atol=1e-5, rtol=0)
-    # measured from the camera's axes, every angle is 90 degrees more: S1 and S2 change sign
-    torch.testing.assert_close(frame[1:], -turned[1:], atol=1e-5, rtol=0)
+    frame = render(scene, still(40.0, 30.0, zoom=2.0), np.zeros(1), 21, 31)[0]
+    torch.testing.assert_close(frame[:, ::2, 1::2], scene.stokes[:, 25:36, 33:48])
 
 
 @pytest.mark.parametrize("roll_deg", [-20.0, 0.0, 20.0, 90.0])
@@ -167,8 +136,3 @@ def test_a_bar_at_30_degrees_polarized_along_itself_stays_so_while_the_camera_ro
     assert bar_deg % 180 == pytest.approx((30 + roll_deg) % 180, abs=0.3)
     assert math.degrees(aolp(frame)[20, 20]) == pytest.approx((30 + roll_deg) % 180, abs=1e-3)
     torch.testing.assert_close(dolp(frame), torch.full((41, 41), 0.75, dtype=torch.float64), atol=1e-5, rtol=0)
-
-
-def test_zoom_2_puts_neighbouring_scene_pixels_two_window_pixels_apart(scene):
-    frame = render(scene, still(40.0, 30.0, zoom=2.0), np.zeros(1), 21, 31)[0]
-    torch.testing.assert_close(frame[:, ::2, 1::2], scene.stokes[:, 25:36, 33:48])

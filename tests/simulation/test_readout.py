@@ -41,16 +41,6 @@ def test_rows_leave_one_after_another_as_the_bus_carries_them(changes, rows, exp
     assert (triples(leaving), lost) == (expected, expected_lost)
 
 
-def test_a_saturated_bus_carries_its_limit():
-    generator = np.random.default_rng(0)
-    t = np.sort(generator.integers(0, 100_000, 50_000))
-    events = events_at(*zip(t, generator.integers(0, 10, 50_000), generator.integers(0, 10, 50_000), strict=True))
-    config = dataclasses.replace(PERFECT, max_events_per_s=2e5, max_wait_us=500.0)
-    leaving, lost = read_out(events, config, key=1, duration_us=100_000)
-    assert len(leaving) == pytest.approx(20_000, rel=0.01)  # 0.1 s of 200,000 a second
-    assert len(leaving) + lost == pytest.approx(50_000, abs=110)  # those still waiting when the recording stops
-
-
 def test_jitter_has_the_stated_deviation_depends_on_the_key_and_keeps_time_order():
     t = np.arange(1000, 21_000)
     events = events_at(*zip(t, t % 10, t // 10 % 10, strict=True))

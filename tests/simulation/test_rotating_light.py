@@ -1,4 +1,3 @@
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,16 +7,13 @@ from event_fixtures import equal
 from simulation_fixtures import QUIET, REST, STILL
 
 from polarnet.config.tree import load
+from polarnet.simulation import SENSORS, emulate, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
-from polarnet.simulation.emulator import emulate
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
-from polarnet.simulation.presets import SENSORS
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
-from polarnet.simulation.scene import scene_from_polarization
-from polarnet.storage.events import EventStore
+from polarnet.storage import EventStore, SceneStore
 from polarnet.storage.frames import Contents, Polarization
-from polarnet.storage.scenes import SceneStore
 
 ROTATING = RotatingConfig(rate_hz=2.0, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=720)
 
@@ -31,25 +27,9 @@ def still_events(sensor, scene, duration_us, rotating=ROTATING, height=4, width=
     return emulate_rotating(rotating, Camera(sensor, key=1), scene, path, duration_us, Grid(height, width))
 
 
-def light_at(times_s, rotating, scene):
-    stokes = scene.stokes.numpy()[:, None].repeat(len(times_s), axis=1)
-    return (
-        behind_polarizers(stokes, rotating.weights(np.rint(1e6 * np.array(times_s)).astype(np.int64)))[0, :, 0, 0] / 255
-    )
-
-
-def test_malus_law_along_at_45_degrees_and_across_the_axis():
-    rotating = replace(ROTATING, rate_hz=0.125, start_angle_deg=30.0)  # 45 degrees a second
-    light = light_at([0, 1, 2], rotating, uniform_scene(1.0, 1.0, math.radians(30)))
-    assert light == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
-
-
-def test_unpolarized_light_fires_nothing_behind_a_rotating_polarizer():
+def test_unpolarized_light_fires_nothing_and_dolp_one_half_three_events_down_and_five_each_way():
     assert len(still_events(SENSORS["clean"], uniform_scene(dolp=0.0), 1_000_000)) == 0
-
-
-def test_dolp_one_half_fires_three_events_down_from_its_mean_and_five_on_each_way_between_its_extremes():
-    """ln(1 + 0.5 cos x) falls from 0 to -0.693 and rises to 0.405; thresholds of 0.2 lie at -0.6 and 0.4."""
+    # ln(1 + 0.5 cos x) falls from 0 to -0.693 and rises to 0.405; thresholds of 0.2 lie at -0.6 and 0.4.
     rotating = replace(ROTATING, start_angle_deg=45.0)
     events = still_events(QUIET, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
     assert events.p.tolist() == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5

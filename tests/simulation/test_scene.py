@@ -6,14 +6,12 @@ import pytest
 import torch
 
 from polarnet.simulation.scene import (
-    check_scene,
     polarization_from_rgb,
     scene_from_intensities,
     scene_from_polarization,
     scene_from_rgb,
-    stretched,
 )
-from polarnet.stokes import aolp, dolp, intensities_from_stokes, intensity_behind_polarizer
+from polarnet.stokes import aolp, dolp, intensities_from_stokes
 
 
 def pixel(*rgb: float) -> torch.Tensor:
@@ -24,13 +22,10 @@ def pixel(*rgb: float) -> torch.Tensor:
     ("rgb", "s0", "degree", "angle_deg"),
     [
         ((1.0, 0.0, 0.0), 1.0, 1.0, 0),  # red
-        ((1.0, 1.0, 0.0), 1.0, 1.0, 30),
         ((0.0, 1.0, 0.0), 1.0, 1.0, 60),  # green
-        ((0.0, 1.0, 1.0), 1.0, 1.0, 90),
         ((0.0, 0.0, 1.0), 1.0, 1.0, 120),  # blue
         ((1.0, 0.0, 1.0), 1.0, 1.0, 150),
         ((0.5, 0.25, 0.25), 0.5, 0.5, 0),  # dull red
-        ((0.4, 0.8, 0.4), 0.8, 0.5, 60),
         ((0.7, 0.7, 0.7), 0.7, 0.0, 0),  # grey
         ((0.0, 0.0, 0.0), 0.0, 0.0, 0),
     ],
@@ -48,33 +43,13 @@ def test_hue_just_below_red_is_an_angle_just_below_180_degrees():
     assert 0 <= polarization_from_rgb(pixel(1.0, 0.0, 1e-12))[2].item() < math.pi
 
 
-@pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 135])
-def test_a_scene_behind_a_polarizer_follows_equation_4(angle_deg):
-    rgb = torch.rand(3, 8, 9, generator=torch.Generator().manual_seed(0))
-    s0, degree, angle = polarization_from_rgb(rgb)
-    theta = math.radians(angle_deg)
-    expected = s0 * (1 - degree) / 2 + s0 * degree * torch.cos(theta - angle) ** 2
-    torch.testing.assert_close(intensity_behind_polarizer(scene_from_rgb(rgb).stokes, theta), expected)
-
-
-def test_measured_intensities_come_back_from_the_scene_they_make():
+def test_measured_intensities_come_back_and_unphysical_ones_are_fully_polarized():
     measured = torch.tensor([0.4, 0.3, 0.1, 0.2]).view(4, 1, 1)  # I0 + I90 = I45 + I135
     torch.testing.assert_close(intensities_from_stokes(scene_from_intensities(measured).stokes), measured)
-
-
-def test_an_unphysical_measurement_is_fully_polarized_at_its_angle():
     stokes = scene_from_intensities(torch.tensor([0.4, 0.4, 0.0, 0.0]).view(4, 1, 1)).stokes
     assert dolp(stokes).item() == pytest.approx(1)  # measured: sqrt(2)
     assert aolp(stokes).item() == pytest.approx(math.pi / 8)
     assert stokes[0].item() == pytest.approx(0.4)
-
-
-def test_numpy_planes_make_the_same_scene():
-    planes = torch.rand(3, 5, 6, generator=torch.Generator().manual_seed(0))
-    expected = scene_from_polarization(*planes).stokes
-    assert torch.equal(scene_from_polarization(*planes.numpy()).stokes, expected)
-    light = intensities_from_stokes(expected)
-    assert torch.equal(scene_from_intensities(light.numpy()).stokes, scene_from_intensities(light).stokes)
 
 
 @pytest.mark.parametrize(
@@ -90,12 +65,3 @@ def test_degrees_percentages_and_bytes_are_no_polarization(s0, dolp, aolp, messa
         scene_from_polarization(*(torch.full((2, 2), value) for value in (s0, dolp, aolp)))
     with pytest.raises(ValueError, match=r"expected S0 = I0 \+ I90 in \[0, 1\], got values up to 1\.6"):
         scene_from_intensities(torch.full((4, 2, 2), 0.8))
-
-
-def test_a_stretched_scene_has_its_dynamic_range_and_the_same_polarization():
-    s0, degree = torch.tensor([[0.0, 0.5, 1.0]]), torch.full((1, 3), 0.4)
-    scene = stretched(scene_from_polarization(s0, degree, torch.full((1, 3), 0.6)), 1e6)
-    assert scene.stokes[0, 0].tolist() == pytest.approx([1e-6, 1e-3, 1], rel=1e-5)
-    assert dolp(scene.stokes)[0].tolist() == pytest.approx([0, 0.4, 0.4], abs=1e-6)  # black has no polarization
-    assert aolp(scene.stokes)[0, 1:].tolist() == pytest.approx([0.6, 0.6], abs=1e-6)
-    check_scene(scene)

@@ -1,34 +1,34 @@
-"""The stage in between: pictures in, scenes, trajectories and exact frames out."""
+"""From pictures to scenes, trajectories and exact frames, and from linear light over six decades to its events."""
 
 import dataclasses
 import functools
 import logging
-import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from part_fixtures import files_of
 from PIL import Image
-from simulation_fixtures import REST, STILL
 
 from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.runtime.cluster import pmap
-from polarnet.simulation.camera import IDEAL, Grid, grid, weights_of
-from polarnet.simulation.dataset import emulate_scenes
+from polarnet.simulation import MOTIONS, SENSORS, Camera, PolarizationScene, scene_from_polarization, scene_from_rgb
+from polarnet.simulation.camera import IDEAL, Grid, weights_of
+from polarnet.simulation.dataset import emulate_scenes, motion_over
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import channel_light
-from polarnet.simulation.presets import MOTIONS
-from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, scene_from_rgb
+from polarnet.simulation.scene import LIGHT_RANGE, logarithmic, scene_from_light, stretched
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
-from polarnet.storage.frames import FrameStore
-from polarnet.storage.scenes import SceneStore
+from polarnet.storage import EventStore, FrameStore, SceneStore
 
 SEQUENCES_PER_PART = 2
 CONFIG = dataclasses.replace(
@@ -64,12 +64,33 @@ def stores(images, tmp_path_factory) -> tuple[SceneStore, FrameStore]:
     return run(images, tmp_path_factory.mktemp("stores"))
 
 
-def test_every_picture_gets_its_sequences_and_all_of_them_its_split(stores):
+def test_the_stored_truth_of_each_picture_is_that_of_its_scene_and_follows_equations_1_to_3(stores):
     scenes, frames = stores
     assert len(scenes.sequences) == len(frames.sequences) == 10
     assert [len(frames.of_split(split)) for split in ("train", "val", "test")] == [6, 2, 2]
     for split in ("train", "val", "test"):
         assert frames.of_split(split) == scenes.of_split(split)
+    scenes, frames = stores
+    t_us = frame_times_us(CONFIG)
+    for sequence in scenes.sequences[:3]:
+        record = scenes.read(sequence)
+        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
+        trajectory = Trajectory.from_vector(scenes.trajectory(sequence))
+        intensity, degree, angle = frames_of(scene, trajectory, t_us, 24, 36)
+        stored = frames.frames(sequence)
+        assert stored.t_us.tolist() == t_us
+        torch.testing.assert_close(stored.intensity, intensity, atol=1 / 65535, rtol=0)
+        torch.testing.assert_close(stored.dolp, degree, atol=1 / 65535, rtol=0)
+        turn = (stored.aolp - angle + torch.pi / 2) % torch.pi - torch.pi / 2
+        assert turn.abs().max() <= torch.pi / 65536
+    _, frames = stores
+    truth = frames.frames(frames.sequences[0])
+    stokes = stokes_from_intensities(truth.intensity)
+    bright = stokes[:, 0] > 0.2
+    torch.testing.assert_close(dolp(stokes)[bright], truth.dolp[bright], atol=3e-4, rtol=0)
+    polarized = bright & (truth.dolp > 0.3)
+    turn = (aolp(stokes) - truth.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
+    assert turn[polarized].abs().max() < 1e-3
 
 
 def test_each_training_sequence_over_a_variant_names_its_picture(images, stores, tmp_path, project_root):
@@ -103,93 +124,20 @@ def test_pictures_too_small_for_the_window_are_left_out(images, stores, tmp_path
     assert not (tmp_path / "none").exists()
 
 
-def test_the_stored_truth_is_what_the_stored_scene_and_trajectory_show(stores):
-    scenes, frames = stores
-    t_us = frame_times_us(CONFIG)
-    for sequence in scenes.sequences[:3]:
-        record = scenes.read(sequence)
-        scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        trajectory = Trajectory.from_vector(scenes.trajectory(sequence))
-        intensity, degree, angle = frames_of(scene, trajectory, t_us, 24, 36)
-        stored = frames.frames(sequence)
-        assert stored.t_us.tolist() == t_us
-        torch.testing.assert_close(stored.intensity, intensity, atol=1 / 65535, rtol=0)
-        torch.testing.assert_close(stored.dolp, degree, atol=1 / 65535, rtol=0)
-        turn = (stored.aolp - angle + torch.pi / 2) % torch.pi - torch.pi / 2
-        assert turn.abs().max() <= torch.pi / 65536
-
-
-def test_the_truth_follows_from_the_four_intensities_by_equations_1_to_3(stores):
-    _, frames = stores
-    truth = frames.frames(frames.sequences[0])
-    stokes = stokes_from_intensities(truth.intensity)
-    bright = stokes[:, 0] > 0.2
-    torch.testing.assert_close(dolp(stokes)[bright], truth.dolp[bright], atol=3e-4, rtol=0)
-    polarized = bright & (truth.dolp > 0.3)
-    turn = (aolp(stokes) - truth.aolp + torch.pi / 2) % torch.pi - torch.pi / 2
-    assert turn[polarized].abs().max() < 1e-3
-
-
-def killed(images: Path, folder: Path, parts: int) -> None:
-    """A run that dies after some parts."""
+def test_a_run_killed_half_way_makes_the_missing_parts_and_ends_with_the_same_bytes(images, stores, tmp_path):
+    made = []
 
     def dies(function, items):
-        for item in items[:parts]:
-            function(item)
+        made.extend(map(function, items[:2]))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(images, folder, mapper=dies)
-    assert not (folder / "frames.zarr").exists()
-
-
-def parts_made_by(images: Path, folder: Path, config: SynthesizeConfig = CONFIG) -> int:
-    made = []
-    run(images, folder, config, lambda function, items: made.extend(items) or [function(item) for item in items])
-    return len(made)
-
-
-def test_a_run_killed_half_way_ends_with_the_same_bytes(images, stores, tmp_path):
-    killed(images, tmp_path, parts=2)
-    assert parts_made_by(images, tmp_path) == 3
+        run(images, tmp_path, mapper=dies)
+    assert not (tmp_path / "frames.zarr").exists()
+    run(images, tmp_path, mapper=lambda function, items: made.extend(items) or [function(item) for item in items])
+    assert len(made) == 5
     for name in ("scenes.zarr", "frames.zarr"):
         assert files_of(tmp_path / name) == files_of(Path(stores[0].path).parent / name)
-
-
-def test_another_setting_is_not_mixed_with_what_an_interrupted_run_left(images, tmp_path):
-    killed(images, tmp_path, parts=1)
-    assert parts_made_by(images, tmp_path, dataclasses.replace(CONFIG, speed_min_px_s=150.0)) == 5
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "expected"),
-    [
-        (7.5, 5.5, [(4, 3)]),  # on the scene's pixels: one pixel shows the masked one
-        (7.75, 5.5, [(4, 2), (4, 3)]),  # between columns: two mix with it
-        (7.5, 5.75, [(3, 3), (4, 3)]),
-        (7.75, 5.75, [(3, 2), (3, 3), (4, 2), (4, 3)]),
-    ],
-)
-def test_a_pixel_is_valid_unless_its_interpolation_uses_a_masked_one(x, y, expected):
-    valid = torch.ones(12, 16, dtype=torch.bool)
-    valid[7, 8] = False
-    trajectory = Trajectory(x, y, REST, REST, STILL, STILL, speed_px_s=1.0)
-    (seen,) = valid_frames(valid, trajectory, [0], Grid(6, 6))  # its first pixel looks at (x, y) - 2.5
-    assert [tuple(place) for place in (~seen).nonzero().tolist()] == expected
-
-
-def test_the_mask_of_a_turning_window_is_that_of_its_weights():
-    """Light from masked pixels alone: what a valid pixel shows does not change when they do."""
-    generator = torch.Generator().manual_seed(1)
-    light = torch.rand(3, 60, 80, generator=generator)
-    valid = torch.rand(60, 80, generator=generator) < 0.98
-    trajectory = random_trajectory(CONFIG, 60, 80, np.random.default_rng(4))
-    rendered = valid_frames(valid, trajectory, [0, 50_000, 100_000], Grid(24, 36))
-    t_s = np.array([0, 0.05, 0.1])
-    changed = torch.where(valid, light, light + 1)
-    before, after = (render(PolarizationScene(planes), trajectory, t_s, 24, 36)[:, 0] for planes in (light, changed))
-    assert torch.equal(rendered, before == after)
-    assert 0.8 < rendered.float().mean() < 0.98
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 0.2])
@@ -211,35 +159,6 @@ def test_a_cell_is_valid_unless_its_truth_or_light_changes_with_masked_pixels(cr
     assert 0.1 < changed.float().mean() < 0.9
 
 
-def test_the_number_of_threads_changes_no_bit_of_a_frame():
-    config = dataclasses.replace(CONFIG, sensor_height=121, sensor_width=179, duration_s=0.4)
-    generator = np.random.default_rng(0)
-    s0, degree, angle = torch.rand(3, 300, 400, generator=torch.Generator().manual_seed(0))
-    scene = scene_from_polarization(s0, degree, math.pi * angle)
-    trajectory = random_trajectory(config, 300, 400, generator)
-
-    def frames(threads):
-        torch.set_num_threads(threads)
-        on_sensor = frames_of(scene, trajectory, frame_times_us(config), 121, 179)
-        assert torch.get_num_threads() == threads
-        return on_sensor
-
-    for one, several in zip(frames(1), frames(3), strict=True):
-        assert torch.equal(one, several)
-
-
-def test_the_truth_of_a_mosaic_is_that_of_the_centres_of_its_cells():
-    """Each cell's truth is the mean of the four pixels' Stokes parameters where the sensor stands on whole pixels."""
-    generator = torch.Generator().manual_seed(3)
-    scene = scene_from_polarization(*torch.rand(3, 40, 60, generator=generator))
-    trajectory = Trajectory(29.5, 19.5, REST, REST, STILL, STILL, 0.0)
-    rows, columns, pitch = grid("dofp", 20, 30)
-    intensities, degree, _ = frames_of(scene, trajectory, [0], rows, columns, pitch)
-    cells = torch.nn.functional.avg_pool2d(scene.stokes[None, :, 10:30, 15:45], 2)[0]
-    assert intensities.shape == (1, 4, 10, 15)
-    torch.testing.assert_close(degree[0], dolp(cells), atol=1e-5, rtol=0)
-
-
 def test_truth_at_any_time_is_that_of_the_stretched_scene(images, tmp_path):
     synthesis = Synthesis(images, dataclasses.replace(CONFIG, dynamic_range=1000.0), 1, SEQUENCES_PER_PART)
     synthesize(synthesis, tmp_path / "scenes", tmp_path / "frames", map)
@@ -257,3 +176,67 @@ def test_a_log_shows_the_progress_inside_a_part_of_a_store(images, simulated, tm
     lines = progress_log()
     for label, parts in (("synthesize", 5), ("emulate", 2)):
         assert any(line.startswith(f"{label}: ") and f"| 0.5/{parts} [" in line for line in lines), lines
+
+
+MOTION = replace(
+    MOTIONS["default"], duration_s=0.2, sensor_height=24, sensor_width=36, speed_min_px_s=60.0, speed_max_px_s=200.0,
+    acceleration_max_px_s2=2000.0,
+)  # fmt: skip
+HEIGHT, WIDTH, DOLP = 80, 120, 0.4
+
+
+def dark_picture() -> np.ndarray:
+    """A reddish texture of 1e-6 to 2e-5 of the brightest light, which shines on one pixel in a corner."""
+    coarse = np.random.default_rng(1).uniform(np.log(1e-6), np.log(2e-5), (8, 12)).astype(np.float32)
+    level = np.exp(cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR))
+    light = level[..., None] * np.array([1, 1 - DOLP, 1 - DOLP], np.float32)
+    light[0, 0] = 1
+    return light
+
+
+def write(path, light: np.ndarray) -> None:
+    if path.suffix == ".png":
+        cv2.imwrite(str(path), np.round(255 * light[..., ::-1]).astype(np.uint8))
+    else:
+        assert oiio.ImageBuf(1e6 * light).write(str(path)), oiio.geterror()  # its scale is free, as in cd/m²
+
+
+@pytest.mark.parametrize(("suffix", "fires"), [(".exr", True), (".hdr", True), (".png", False)])
+def test_the_pipeline_sees_the_dark_part_of_a_photograph_of_six_decades(project_root, tmp_path, suffix, fires):
+    config = load(project_root)
+    (tmp_path / "pictures").mkdir()
+    write(tmp_path / "pictures" / f"night{suffix}", dark_picture())
+    images, scenes, frames, events = (tmp_path / name for name in ("images", "scenes", "frames", "events"))
+    taken = replace(
+        config.ingest, source="folder", root=str(tmp_path / "pictures"), height=HEIGHT, width=WIDTH, val_fraction=0.0,
+        test_fraction=0.0,
+    )  # fmt: skip
+    ingest(taken, 1, images, map)
+    (entry,) = read_manifest(images).pictures
+    assert entry.bits == (32 if fires else 8)
+    synthesize(Synthesis(images, MOTION, 1, 8, config.variation), scenes, frames, map)
+    camera = Camera(replace(SENSORS["clean"], dark_dn=0.0))
+    emulate_scenes(scenes, events, camera, 1, map, threads=1)
+    store, truth = EventStore.open(events), FrameStore.open(frames)
+    counts = [sum(map(len, store.read(sequence))) for sequence in store.sequences]
+    assert len(counts) == 2  # the picture, and its variant of other light
+    assert counts[0] > 1000 if fires else max(counts) == 0, counts
+    if fires:
+        original = truth.frames(store.sequences[0])
+        assert original.dolp.numpy() == pytest.approx(DOLP, abs=0.01 if suffix == ".hdr" else 0.001)
+        scene, *_ = motion_over(SceneStore.open(scenes), store.sequences[0])
+        light = torch.from_numpy(dark_picture()).amax(dim=-1)
+        torch.testing.assert_close(scene.stokes[0], light, rtol=0.01 if suffix == ".hdr" else 2e-4, atol=0)
+
+
+def test_dark_light_is_polarized_like_bright_light_and_its_logarithm_is_stretched_to_it():
+    light = torch.rand(3, 6, 8, generator=torch.Generator().manual_seed(1)) * 0.9 + 0.1
+    bright, dark = scene_from_light(light).stokes, scene_from_light(light * 1e-6).stokes
+    torch.testing.assert_close(dark, bright * 1e-6, rtol=1e-5, atol=1e-12)
+    assert dolp(dark).max() > 0.5
+    assert aolp(dark).max() > 2
+    assert scene_from_light(torch.zeros(3, 1, 1)).stokes.tolist() == [[[0.0]]] * 3
+    s0 = torch.logspace(-8, 0, 40).view(4, 10)
+    scene = scene_from_polarization(logarithmic(s0, LIGHT_RANGE), torch.full((4, 10), 0.3), torch.zeros(4, 10))
+    torch.testing.assert_close(stretched(scene, LIGHT_RANGE).stokes[0], s0, rtol=1e-4, atol=0)
+    assert logarithmic(torch.zeros(1, 1), LIGHT_RANGE) == 0

@@ -11,7 +11,7 @@ from scipy import stats
 from simulation_fixtures import QUIET
 
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.pixels.voltmeter import CAMERAS, chance_of_on
+from polarnet.simulation.pixels.voltmeter import CAMERAS
 
 CONFIG = dataclasses.replace(QUIET, model="dvs_voltmeter")
 SIDE = 50
@@ -50,23 +50,3 @@ def test_the_time_to_the_first_event_is_inverse_gaussian(camera, before, after, 
     law = stats.invgauss(mu=noise**2 / abs(drift), scale=1 / noise**2)  # mean 1 / drift, shape 1 / noise^2
     assert law.mean() == pytest.approx(1 / abs(drift))
     assert stats.kstest(times, law.cdf).pvalue > 0.01
-
-
-def test_the_first_threshold_to_be_met_is_decided_by_drift_and_distance():
-    # without drift over noise either is as likely; against strong drift none; the limit of weak drift is even
-    assert chance_of_on(0.0, 1e-5, 1.0, 1.0) == 0.5
-    assert chance_of_on(1e-5, 1e-5, 1.0, 1.0) == 1.0
-    assert chance_of_on(-1e-5, 1e-5, 1.0, 1.0) == 0.0
-    assert chance_of_on(1e-16, 1e-5, 1.0, 1.0) == pytest.approx(0.5, abs=1e-3)
-    # (e^2 - 1) / (e^2 - e^-2) for 2 mu / s^2 = 2
-    expected = (math.exp(2) - 1) / (math.exp(2) - math.exp(-2))
-    assert chance_of_on(1e-10, 1e-5, 1.0, 1.0) == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_still_bright_scene_leaks_on_events_at_the_rate_of_its_light():
-    # k4 + k5 * 200 = 1.1e-6 thresholds per microsecond: 1.1 ON events a second
-    frames = torch.full((1, 1, SIDE, SIDE), 200.0).expand(91, -1, -1, -1)
-    t_us = torch.from_numpy(np.rint(np.arange(91) * 1e6 / 30))
-    (events,), _ = emulate(frames, t_us, CONFIG, key=11)
-    assert (events.p == 1).float().mean() > 0.99
-    assert len(events) == pytest.approx(1.1 * 3 * SIDE**2, rel=0.12)  # an event may be under way at both ends

@@ -40,11 +40,13 @@ def test_every_stored_value_comes_back_as_itself(name):
     assert np.array_equal(quantise(name, dequantise(name, STEPS)), STEPS)
 
 
-def test_the_ends_of_the_range_are_exact():
+def test_the_ends_of_the_range_are_exact_and_a_degree_is_no_radian():
     assert dequantise("s0", quantise("s0", torch.tensor([0.0, 1.0]))).tolist() == [0.0, 1.0]
     angles = torch.tensor([0.0, math.pi / 2, math.pi - 1e-6])  # the last one rounds up to pi
     assert dequantise("aolp", quantise("aolp", angles)).tolist() == pytest.approx([0, math.pi / 2, 0])
     assert float(dequantise("aolp", STEPS).max()) < math.pi
+    with pytest.raises(ValueError, match=r"radians in \[0, 3\.14159\], got values up to 90; .* torch\.deg2rad"):
+        quantise("aolp", torch.tensor([90.0]))
 
 
 @pytest.mark.parametrize("bad", [-0.01, 1.01, math.nan, math.inf])
@@ -53,12 +55,7 @@ def test_a_fraction_out_of_range_is_refused(bad):
         quantise("dolp", torch.tensor([0.5, bad]))
 
 
-def test_a_degree_taken_for_a_radian_is_refused():
-    with pytest.raises(ValueError, match=r"radians in \[0, 3\.14159\], got values up to 90; .* torch\.deg2rad"):
-        quantise("aolp", torch.tensor([90.0]))
-
-
-def test_frames_come_back_to_half_a_step_however_many_a_sequence_has(finished):
+def test_frames_come_back_to_half_a_step_with_their_splits_and_pictures(finished, tmp_path):
     store = FrameStore.open(finished)
     for name, (t_us, intensity, dolp, aolp) in (("a", frames_of(1)), ("b", frames_of(2, n=33))):
         frames = store.frames(name)
@@ -69,9 +66,6 @@ def test_frames_come_back_to_half_a_step_however_many_a_sequence_has(finished):
         assert torch.equal(store.quantity("dolp", name), frames.dolp)
         some = store.frames(name, 5, 9)
         assert all(torch.equal(part, whole[5:9]) for part, whole in zip(some[:4], frames[:4], strict=True))
-
-
-def test_splits_are_kept_in_order(finished):
     store = FrameStore.open(finished)
     assert store.splits == {"a": "train", "b": "test"}
     assert [store.of_split(split) for split in ("train", "val", "test")] == [["a"], [], ["b"]]
@@ -79,9 +73,6 @@ def test_splits_are_kept_in_order(finished):
         store.of_split("validation")
     with pytest.raises(ValueError, match=r"splits\.b: expected one of train, val, test, got 'none'"):
         FrameStore.create("frames.zarr", Contents({"a": "train", "b": "none"}), height=4, width=4)
-
-
-def test_a_picture_and_its_variants_are_one_picture(tmp_path):
     attributes = {"scenes": {"lake-00": "lake", "lake-variant01-00": "lake-variant01"}}
     names = ["lake-00", "lake-variant01-00", "other"]
     contents = Contents(dict.fromkeys(names, "train"), attributes, variant_of={"lake-variant01-00": "lake"})
@@ -89,13 +80,18 @@ def test_a_picture_and_its_variants_are_one_picture(tmp_path):
     assert [store.original_of(name) for name in names] == ["lake", "lake", "other"]
 
 
-def test_black_unpolarized_frames_are_not_taken_for_missing_ones(tmp_path):
+def test_black_frames_are_there_and_numpy_frames_and_a_path_of_text_make_the_same_store(tmp_path, finished):
     store = store_at(tmp_path / "f.zarr", names=["a"])
     t_us, intensity, dolp, aolp = frames_of(1)
     store.write("a", t_us, 0 * intensity, 0 * dolp, 0 * aolp)
     store.finish()
     assert FrameStore.verify(tmp_path / "f.zarr") == []
     assert FrameStore.open(tmp_path / "f.zarr").frames("a").intensity.abs().max() == 0
+    store = FrameStore.create(str(tmp_path / "n.zarr"), Contents({"a": "train"}), 4, 6)
+    store.write("a", *(values.numpy() for values in frames_of(1)))
+    store.finish()
+    written, expected = (FrameStore.open(str(path)).frames("a") for path in (tmp_path / "n.zarr", finished))
+    assert all(torch.equal(a, b) for a, b in zip(written[:4], expected[:4], strict=True))
 
 
 def test_frames_of_a_wrong_shape_range_type_or_order_are_refused(tmp_path, unchecked_annotations):
@@ -132,11 +128,3 @@ def test_a_mask_comes_back_as_it_was(tmp_path, finished):
     assert FrameStore.verify(tmp_path / "frames.zarr") == []
     assert FrameStore.open(finished).frames("a").valid is None
     assert not (finished / "part-00000" / "valid").exists()
-
-
-def test_numpy_frames_and_a_path_of_text_make_the_same_store(tmp_path, finished):
-    store = FrameStore.create(str(tmp_path / "n.zarr"), Contents({"a": "train"}), 4, 6)
-    store.write("a", *(values.numpy() for values in frames_of(1)))
-    store.finish()
-    written, expected = (FrameStore.open(str(path)).frames("a") for path in (tmp_path / "n.zarr", finished))
-    assert all(torch.equal(a, b) for a, b in zip(written[:4], expected[:4], strict=True))

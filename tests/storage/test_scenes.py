@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from part_fixtures import files_of
 
 from polarnet.storage.frames import Contents, Polarization
 from polarnet.storage.scenes import SceneStore, as_stored
@@ -45,31 +44,13 @@ def test_a_sequence_comes_back_with_its_picture_and_its_exact_trajectory(finishe
     store, (s0, dolp, aolp, _) = SceneStore.open(finished), SCENES["leaves"]
     read = store.read("leaves-0")
     assert (store.scene_of["leaves-0"], store.duration_us("leaves-0")) == ("leaves", 1_000_002)
+    assert (store.sensor_height, store.sensor_width, store.trajectory_names) == (8, 12, NAMES)
+    assert (store.of_split("train"), store.attributes) == (["coffee-0", "coffee-1"], {"seed": 1})
+    assert all(torch.equal(a, b) for a, b in zip(read[:3], as_stored(SCENES["leaves"])[:3], strict=True))
     assert store.trajectory("leaves-0").tolist() == [math.pi, 2.0, -1e-300]
     torch.testing.assert_close(read.s0, s0, atol=0.51 / 65535, rtol=0)
     torch.testing.assert_close(read.dolp, dolp, atol=0.51 / 65535, rtol=0)
     torch.testing.assert_close(read.aolp, aolp, atol=0.51 * math.pi / 65536, rtol=0)
-
-
-def test_a_scene_is_known_before_it_is_stored(finished):
-    read, stored = SceneStore.open(finished).read("leaves-0"), as_stored(SCENES["leaves"])
-    assert all(torch.equal(a, b) for a, b in zip(read[:3], stored[:3], strict=True))
-
-
-def test_sequences_over_one_picture_have_their_own_motion(finished):
-    store = SceneStore.open(finished)
-    assert torch.equal(store.read("coffee-0").s0, store.read("coffee-1").s0)
-    assert store.trajectory("coffee-0")[1] != store.trajectory("coffee-1")[1]
-
-
-def test_a_part_begun_again_holds_its_pictures(finished, tmp_path):
-    store = create(tmp_path / "scenes.zarr")
-    store.write("coffee-0", scene(3, 20, 30), STILL, 1)
-    for name in store.sequences:
-        read = SceneStore.open(finished)
-        store.write(name, read.read(name), read.trajectory(name), read.duration_us(name))
-    store.finish()
-    assert files_of(tmp_path / "scenes.zarr") == files_of(finished)
 
 
 def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
@@ -78,12 +59,6 @@ def test_a_picture_and_its_variants_are_never_in_two_splits(tmp_path):
         create(tmp_path / "scenes.zarr", splits=splits)
     with pytest.raises(ValueError, match="picture coffee would be in the splits train and test"):
         create(tmp_path / "scenes.zarr", variant_of={"leaves-0": "coffee"})
-
-
-def test_the_store_says_what_it_holds(finished):
-    store = SceneStore.open(finished)
-    assert (store.sensor_height, store.sensor_width, store.trajectory_names) == (8, 12, NAMES)
-    assert (store.of_split("train"), store.attributes) == (["coffee-0", "coffee-1"], {"seed": 1})
 
 
 def test_what_cannot_be_a_scene_is_refused(tmp_path):
@@ -100,7 +75,7 @@ def test_what_cannot_be_a_scene_is_refused(tmp_path):
         store.write("tea", SCENES["leaves"], STILL, 1)
 
 
-def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_everywhere(tmp_path):
+def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_everywhere(tmp_path, finished):
     store = create(tmp_path / "scenes.zarr", masked=True)
     valid = torch.rand(10, 14, generator=torch.Generator().manual_seed(1)) < 0.5
     masks = {"coffee": None, "leaves": valid}
@@ -111,11 +86,6 @@ def test_a_mask_comes_back_with_its_picture_and_one_that_has_none_is_valid_every
     assert torch.equal(read.read("leaves-0").valid, valid)
     assert read.read("coffee-0").valid.all()
     assert SceneStore.verify(tmp_path / "scenes.zarr") == []
-
-
-def test_without_masks_nothing_is_stored_about_them(finished, tmp_path):
     assert SceneStore.open(finished).read("leaves-0").valid is None
-    assert not (finished / "part-00000" / "valid").exists()
-    masked = SCENES["leaves"]._replace(valid=torch.ones(10, 14).bool())
     with pytest.raises(ValueError, match="got a mask for a store without one"):
-        create(tmp_path / "scenes.zarr").write("leaves-0", masked, STILL, 1)
+        create(tmp_path / "others.zarr").write("leaves-0", SCENES["leaves"]._replace(valid=valid), STILL, 1)

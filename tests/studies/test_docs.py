@@ -42,7 +42,7 @@ def project(tmp_path):
     return tmp_path
 
 
-def test_a_table_has_a_row_for_each_entry_and_its_caption_names_the_commit(project):
+def test_a_table_has_a_row_for_each_entry_or_those_chosen_and_its_caption_names_the_commit(project):
     assert block_text(read_tables(project)["speed"], read_file(project, "speed")).splitlines() == [
         "| model | MSE | gain | n |",
         "|---|---:|---:|---:|",
@@ -51,15 +51,9 @@ def test_a_table_has_a_row_for_each_entry_and_its_caption_names_the_commit(proje
         "",
         "2 models. Commit `0123456789`.",
     ]
-
-
-def test_rows_are_chosen_by_hand_and_a_section_that_was_not_measured_says_what_measures_it(project):
     text = block_text(read_tables(project)["chosen"], read_file(project, "speed"))
     assert text == "|  | MSE |\n|---|---:|\n| the best | 0.0 |"
     assert block_text(read_tables(project)["speed"], {}).startswith("Not measured yet")
-
-
-def test_a_row_with_the_unwanted_values_is_left_out(project):
     assert block_text(read_tables(project)["without"], read_file(project, "speed")).splitlines()[2:] == ["| b |"]
 
 
@@ -89,16 +83,13 @@ def test_a_block_that_is_open_or_unknown_is_an_error(project, text, error):
         update_pages(project, check=True)
 
 
-def test_every_block_of_the_documentation_is_measured_and_shown(project_root):
+def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_root, project):
     pages = "".join(page.read_text() for page in [project_root / "README.md", *(project_root / "docs").glob("*.md")])
     for name, table in read_tables(project_root).items():
         text = block_text(table, read_file(project_root, table["file"]))
         assert "Not measured" not in text, name
         assert any(digit in text for digit in "123456789"), name
         assert f"<!-- results:{name} -->" in pages
-
-
-def test_machines_are_listed_once_and_every_measurement_with_its_machine_and_commit(project, project_root):
     assert read_file(project, "records") == {
         "machines": [{"letter": "A", "machine": "Xeon", "cores": 2, "units": None, "versions": "torch 2.13.0"}],
         "measured": {"speed": "models: A, load 0.5, `0123456789`"},

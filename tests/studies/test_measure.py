@@ -4,7 +4,7 @@ import pytest
 
 from polarnet.reports.artefacts import git
 from studies import study
-from studies.measure import measure_pipeline, measure_run
+from studies.measure import measure_pipeline
 from studies.study import arguments_of, command_line, uncommitted, write_section
 
 IDENTITY = ("-c", "user.name=a", "-c", "user.email=a@b.c")
@@ -27,21 +27,6 @@ def test_a_section_of_the_results_is_replaced_and_headlines_join_what_is_there(t
         "records": {"readers": {"commit": "b"}, "rig": {"commit": "c"}},
         "rig": {"captures": 32},
     }
-
-
-def test_a_finished_run_becomes_rows_scenes_and_pairs(tmp_path):
-    folder = tmp_path / "benchmark" / "sets" / "simulated"
-    folder.mkdir(parents=True)
-    row = {"mse": 0.5, "mse_ci": [0.4, 0.6]}
-    for name, content in {
-        "metrics": {"cf": row, "ours": row}, "cost": {"cf": {"params": 0}, "ours": {"params": 9}},
-        "details": {"scenes": {"a": {}, "b": {}}, "frames": 50, "paired": {"cf": {"mse": {"better": 2}, "ssim": {}}}},
-    }.items():  # fmt: skip
-        (folder / f"{name}.json").write_text(json.dumps(content))
-    commit_all(tmp_path)
-    written = json.loads(measure_run("paper", tmp_path, tmp_path).read_text())["paper_small"]
-    assert (written["scenes"], written["frames"], written["paired"]) == (2, 50, {"cf": {"better": 2}})
-    assert [(one["mse"], one["params"]) for one in written["rows"].values()] == [(0.5, 0), (0.5, 9)]
 
 
 def test_what_is_measured_is_no_change_of_what_it_names(tmp_path):

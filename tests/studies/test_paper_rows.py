@@ -27,7 +27,7 @@ def functions_of(path):
     return {node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)}
 
 
-def test_every_row_says_where_it_stands_in_the_paper_and_what_polarnet_does(rows):
+def test_every_row_says_where_it_stands_and_its_files_and_test_are_there(rows, project_root):
     assert len(rows) >= 52
     assert len({row["row"] for row in rows}) == len(rows)
     for row in rows:
@@ -35,9 +35,6 @@ def test_every_row_says_where_it_stands_in_the_paper_and_what_polarnet_does(rows
         assert row["status"] in STATUSES, row["row"]
         assert row["paper"][0] in "12345", row["row"]
         assert row["status"] == "exact" or row["note"], f"{row['row']}: a choice needs its reason"
-
-
-def test_every_file_and_test_of_the_list_is_there(rows, project_root):
     for row in rows:
         for file in [row["where"]] if isinstance(row["where"], str) else row["where"]:
             assert (project_root / file).is_file(), f"{row['row']}: {file}"

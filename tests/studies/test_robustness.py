@@ -1,11 +1,8 @@
-import itertools
-
 import pytest
 
 from polarnet.benchmark.score import FrameScore
 from studies.robustness import SENSORS, Scores, headlines, table_of
 from studies.scored_pictures import settings, sources_of
-from studies.speed import EVENTS_PER_PIXEL, random_channels, windows_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
 DOLP = {"pale": 0.03, "middle": 0.1, "strong": 0.5}
@@ -48,12 +45,3 @@ def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
 @pytest.mark.parametrize("name", SENSORS)
 def test_every_sensor_but_the_default_changes_the_configuration(name):
     assert (settings(*SENSORS[name]) == settings()) == (name == "default")
-
-
-def test_random_windows_follow_each_other_and_hold_as_many_events_as_a_camera_fires():
-    windows = windows_of(random_channels(24, 36, 5), 5)
-    assert all(one.stop_us == after.start_us for one, after in itertools.pairwise(windows))
-    for window in windows:
-        assert all(((events.t >= window.start_us) & (events.t < window.stop_us)).all() for events in window.channels)
-    per_pixel = sum(len(events) for window in windows for events in window.channels) / (5 * 4 * 24 * 36)
-    assert per_pixel == pytest.approx(EVENTS_PER_PIXEL, rel=0.01)

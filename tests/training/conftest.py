@@ -8,8 +8,7 @@ import torch
 
 from polarnet.events.stream import Events
 from polarnet.runtime.machine import generator_for
-from polarnet.storage.events import EventStore
-from polarnet.storage.frames import Contents, FrameStore
+from polarnet.storage import Contents, EventStore, FrameStore
 
 HEIGHT, WIDTH, WINDOWS, WINDOW_US = 16, 24, 6, 10_000
 SPLITS = {"a": "train", "b": "train", "c": "train", "d": "val", "e": "test"}

@@ -20,10 +20,10 @@ from polarnet.runtime.machine import precision_on
 from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
-from polarnet.training.engine.loop import LoopConfig, TrainConfig, runs_of, set_learning_rate, train, validate
+from polarnet.training.engine.loop import LoopConfig, TrainConfig, set_learning_rate, train, validate
 from polarnet.training.engine.losses import LossConfig
 from polarnet.training.engine.recorder import Recorder, read_history, read_running
-from polarnet.training.engine.sequences import Batch, stack
+from polarnet.training.engine.sequences import stack
 from polarnet.training.engine.task import Task, describe, open_split
 
 SEED = 7
@@ -57,16 +57,6 @@ class Killed(Exception):
 
 def small_task() -> Task:
     return dolp_task("paper", NETWORK, TRAIN, LOSS, None, SEED)
-
-
-def test_counts_kept_as_bytes_reach_the_network_as_the_same_numbers_in_float32():
-    counts = torch.randint(-128, 128, (4, 2, 4, 16, 20)).to(torch.int8)
-    truth, none = torch.rand(4, 2, 16, 20), torch.zeros(0, 2, 4, 16, 20)
-    runs = list(runs_of(small_task(), Batch(["a", "b"], counts, truth, truth, none), 3, CPU))
-    assert [len(windows) for windows, _, _ in runs] == [3, 1]
-    windows = torch.cat([windows for windows, _, _ in runs])
-    assert windows.dtype == torch.float32
-    assert torch.equal(windows, counts.float())
 
 
 def run(task: Task, stores: tuple[Path, Path], folder: Path, config: LoopConfig = TRAIN, workers: int = 0) -> Path:
@@ -114,9 +104,7 @@ def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path, config:
 
 
 @pytest.mark.parametrize("killed_at", [8, 9, 12])  # each of two epochs has eight steps, validation included
-def test_a_training_killed_at_any_step_and_resumed_ends_as_if_nothing_had_happened(
-    stores, tmp_path, undisturbed, killed_at
-):
+def test_a_training_killed_at_any_step_ends_as_if_undisturbed(stores, tmp_path, undisturbed, killed_at):
     killed(small_task(), killed_at, stores, tmp_path)
     assert files_of(run(small_task(), stores, tmp_path)) == undisturbed
 
@@ -193,6 +181,8 @@ def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(s
     assert voxels.shape == (6, 2 * 4, 5, 16, 24)
     assert torch.equal(voxels[:, 4 + 3], batch.inputs[:, 1, 15:20])  # second sequence, 135 degrees
     assert torch.equal(intensity[:, 4 + 3], batch.intensity[:, 1, 3])
+    masked = batch._replace(valid=batch.dolp > 0.2)
+    assert torch.equal(task.streams(masked)[2], masked.valid.repeat_interleave(4, dim=1))  # four channels of each
 
 
 @pytest.mark.parametrize("precision", ["bf16", "auto"])

@@ -10,12 +10,16 @@ def frames(value: float) -> torch.Tensor:
     return torch.full((2, 3, 12, 12), value)
 
 
-def test_constant_frames_half_apart():
+def test_constant_frames_half_apart_and_a_loss_of_nothing_or_without_its_network():
     terms = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None)(frames(0.25), frames(0.75))
     assert terms["mse"].item() == 0.25
     assert terms["mae"].item() == 0.5
     luminance = (2 * 0.25 * 0.75 + 0.01**2) / (0.25**2 + 0.75**2 + 0.01**2)  # all that SSIM sees of constants
     assert terms["ssim_loss"].item() == pytest.approx(1 - luminance, rel=1e-5)
+    with pytest.raises(ValueError, match=r"lpips: its weight is 10.0, but there is no LPIPS network"):
+        of_dolp(1.0, 1.0, 10.0)
+    with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
+        of_dolp(0.0, 0.0, 0.0)
 
 
 def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> PolarizationLoss:
@@ -33,13 +37,6 @@ def test_the_total_is_equation_9_with_lpips_where_there_is_a_network():
         loss = of_dolp(2.0, 3.0, weight, lpips)
         torch.testing.assert_close(loss.total(loss(predicted, truth)), expected)
     assert of_dolp(1.0, 1.0, 0.0).weights == {"mse": 1.0, "ssim_loss": 1.0}
-
-
-def test_a_loss_of_nothing_and_a_weight_of_lpips_without_a_network_are_refused():
-    with pytest.raises(ValueError, match=r"lpips: its weight is 10.0, but there is no LPIPS network"):
-        of_dolp(1.0, 1.0, 10.0)
-    with pytest.raises(ValueError, match="mse, ssim, lpips: expected at least one weight > 0"):
-        of_dolp(0.0, 0.0, 0.0)
 
 
 def of_everything(dolp: float, s1: float, s2: float) -> torch.Tensor:
@@ -63,14 +60,10 @@ def of_two_frames(half_weight: float | None) -> tuple[PolarizationLoss, torch.Te
     """A loss, and predictions and truths of an unpolarized frame and of one with a mean squared DoLP of 0.25."""
     config = LossConfig(mse=2.0, ssim=0.0, lpips=0.0, stokes=3.0, half_weight=half_weight)
     truth = torch.stack([of_everything(0.0, 0.0, 0.0)[0, 0], of_everything(0.5, 0.3, 0.4)[0, 0]])[:, None]
-    return (
-        PolarizationLoss(config, None, dolp_only=False),
-        truth + torch.tensor([0.1, 0.2, 0])[:, None, None],
-        truth,
-    )
+    return (PolarizationLoss(config, None, dolp_only=False), truth + torch.tensor([0.1, 0.2, 0])[:, None, None], truth)
 
 
-def test_with_a_half_weight_errors_count_half_where_the_mean_squared_dolp_has_that_value():
+def test_with_a_half_weight_polarized_frames_count_half_and_masked_ones_not_at_all():
     plain, predicted, truth = of_two_frames(half_weight=None)
     relative, _, _ = of_two_frames(half_weight=0.25)
     shares = (1 + 0.5) / 2  # of the unpolarized and the polarized frame
@@ -80,9 +73,6 @@ def test_with_a_half_weight_errors_count_half_where_the_mean_squared_dolp_has_th
         "relative_mse": round(shares * 0.01, 6), "relative_stokes": round(shares * 0.04, 6),
     }  # fmt: skip
     torch.testing.assert_close(relative.total(terms), shares * plain.total(plain(predicted, truth)))
-
-
-def test_frames_without_a_valid_pixel_count_in_no_relative_term_and_leave_the_gradient_finite():
     relative, predicted, truth = of_two_frames(half_weight=0.25)
     predicted = predicted.clone().requires_grad_()
     valid = torch.ones(2, 1, 12, 12, dtype=torch.bool)
@@ -113,12 +103,3 @@ def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
     loss.total(terms).backward()
     assert (predicted.grad[~valid] == 0).all()
     assert (predicted.grad[valid] != 0).float().mean() > 0.99
-
-
-def test_a_batch_of_which_nothing_is_known_costs_nothing_and_can_be_trained_on():
-    loss = FrameLoss({"mse": 1.0, "ssim_loss": 1.0}, None)
-    predicted = torch.rand(1, 2, 12, 12, requires_grad=True)
-    total = loss.total(loss(predicted, torch.rand(1, 2, 12, 12), torch.zeros(1, 2, 12, 12, dtype=torch.bool)))
-    total.backward()
-    assert total.item() == 0
-    assert (predicted.grad == 0).all()

@@ -8,8 +8,7 @@ from polarnet import stokes
 from polarnet.events.representations import event_tensor
 from polarnet.events.stream import slice_time
 from polarnet.runtime.machine import generator_for
-from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage import EventStore, FrameStore
 from polarnet.training.engine.sequences import (
     MEMORY_SHARE,
     View,
@@ -92,15 +91,6 @@ def test_an_item_is_a_whole_sequence_with_the_truth_at_each_windows_end(stores):
         assert torch.equal(own, truth[1:])
 
 
-def test_sequences_that_one_store_lacks_and_stores_of_different_sensors_are_refused(stores, tmp_path):
-    frames = FrameStore.open(stores[1])
-    with pytest.raises(ValueError, match="f: not both in"):
-        WindowDataset(EventStore.open(stores[0]), frames, ["a", "f"], event_tensor)
-    small = EventStore.create(tmp_path / "small.zarr", ["a"], 2, 3, {})
-    with pytest.raises(ValueError, match="events are 2x3 px"):
-        WindowDataset(small, frames, ["a"], event_tensor)
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_dataset_in_memory_is_read_once_by_this_process_or_by_workers(stores, workers):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
@@ -137,22 +127,25 @@ def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():
         assert packed(before, intensity=True) is before
 
 
-def test_a_crop_larger_than_the_image_and_a_batch_of_unequal_lengths_are_refused():
+def test_a_crop_a_batch_and_stores_that_do_not_fit_are_refused(stores, tmp_path):
     config = ViewConfig(visits=1, windows=None, crop=[16, 16], symmetries=True)
     with pytest.raises(ValueError, match="at most the 3 windows of 6x8 pixels of the sequences, got 3 of 16x16"):
         random_view(3, 6, 8, config, generator_for(1, "s", "0"))
 
     with pytest.raises(ValueError, match=r"equally many windows, got \[3, 4\]; use batch_size=1"):
         stack([sequence(windows=3), sequence(windows=4)])
+    frames = FrameStore.open(stores[1])
+    with pytest.raises(ValueError, match="f: not both in"):
+        WindowDataset(EventStore.open(stores[0]), frames, ["a", "f"], event_tensor)
+    small = EventStore.create(tmp_path / "small.zarr", ["a"], 2, 3, {})
+    with pytest.raises(ValueError, match="events are 2x3 px"):
+        WindowDataset(small, frames, ["a"], event_tensor)
 
 
-def test_the_order_is_a_permutation_that_depends_on_seed_and_epoch():
+def test_the_order_is_a_permutation_and_batches_follow_it_with_a_small_last_one():
     assert sorted(shuffled(9, seed=1, epoch=0)) == list(range(9))
     assert shuffled(9, seed=1, epoch=0) == shuffled(9, seed=1, epoch=0)
     assert len({tuple(shuffled(9, seed, epoch)) for seed in (1, 2) for epoch in (0, 1)}) == 4
-
-
-def test_batches_follow_the_order_and_the_last_may_be_small():
     dataset = Visits([sequence("a"), sequence("bb"), sequence("ccc")], PLAIN, seed=1, epoch=0)
     names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
     assert names == [["ccc", "a"], ["bb"]]

@@ -1,36 +1,30 @@
-"""The tasks of trainings: their start, their record, and masks."""
+"""The tasks of trainings: their start, their record, their losses, and masks."""
 
 import dataclasses
 import json
 from pathlib import Path
 
 import pytest
-import test_loop
 import torch
-from test_loop import LOSS, NETWORK
+from test_loop import LOOP, LOSS, NETWORK, SEED, TRAIN, run
 
+from polarnet.config.tree import load
+from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.similarity import ssim
 from polarnet.networks.base.checkpoint import load_checkpoint, save_checkpoint
+from polarnet.networks.e2p.network import coded_aolp
 from polarnet.runtime.files import sha256
 from polarnet.storage.events import EventStore
-from polarnet.storage.frames import Contents, FrameStore
+from polarnet.training.baselines import BASELINES
 from polarnet.training.dolp import dolp_task
-from polarnet.training.e2v import e2v_task
-from polarnet.training.engine.loop import validate
-from polarnet.training.engine.sequences import batches_of
+from polarnet.training.e2p import BranchLoss, E2pConfig, e2p_task
+from polarnet.training.engine.sequences import stack
 from polarnet.training.engine.task import Split, Task, describe, open_split
-
-SEED = 5
-CHANGES = {"visits": 1, "epochs": 1, "bptt_windows": 2, "schedule": "constant", "warmup": 0.0}
-TRAIN = dataclasses.replace(test_loop.TRAIN, **CHANGES)
-E2V = dataclasses.replace(test_loop.E2V, **CHANGES, bins=3)
+from stages import train
 
 
 def dolp() -> Task:
     return dolp_task("paper", NETWORK, TRAIN, LOSS, None, SEED)
-
-
-def e2v() -> Task:
-    return e2v_task(E2V, None, SEED)
 
 
 def split_of(simulated, task: Task) -> Split:
@@ -64,35 +58,53 @@ def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_mach
     assert str(tmp_path) not in json.dumps(described["training"])
 
 
-@pytest.fixture
-def masked(simulated, tmp_path):
-    """The simulated sequences with the left third of all frames masked, and all of the first three frames."""
-    source = FrameStore.open(simulated.frames)
-    contents = Contents(source.splits, masked=True)
-    frames = FrameStore.create(tmp_path / "masked.zarr", contents, source.height, source.width)
-    for name in source.sequences:
-        truth = source.frames(name)
-        valid = torch.ones_like(truth.dolp, dtype=torch.bool)
-        valid[..., :8] = False
-        valid[:3] = False
-        frames.write(name, *truth[:4], valid)
-    frames.finish()
-    return simulated._replace(frames=tmp_path / "masked.zarr")
+E2P = E2pConfig(
+    **LOOP | {"visits": 1, "windows": 3, "epochs": 1}, bins=5, intensity_lpips=0.0, lpips=0.0, mse=50.0, ssim=1.0
+)
 
 
-def test_training_and_validation_leave_masked_pixels_out(masked, simulated):
-    task, cpu = dolp(), torch.device("cpu")
-    split = split_of(masked, task)
-    (val,) = split.val
-    assert val.valid.shape == val.dolp.shape
-    assert val.valid.float().mean() == pytest.approx(4 / 6 * 2 / 3)
-    with torch.no_grad():
-        predicted, _ = task.unroll(val.inputs[:, None], None)
-    expected = (predicted[2:, 0, 0, :, 8:] - val.dolp[2:, :, 8:]).square().mean().item()
-    config = dataclasses.replace(TRAIN, bptt_windows=6)
-    assert validate(task, split.val, config, cpu, workers=0)["mse"] == pytest.approx(expected, rel=1e-4)
-    plain = validate(task, split_of(simulated, task).val, config, cpu, workers=0)["mse"]
-    assert plain != pytest.approx(expected, rel=1e-3)
-    batch = next(batches_of(split.train, [0, 1], 2, workers=0))
-    valid = e2v().streams(batch._replace(inputs=torch.zeros(6, 2, 12, 18, 24)))[2]
-    assert torch.equal(valid, torch.stack([batch.valid[:, k // 4] for k in range(8)], dim=1))  # four channels of each
+def test_a_training_of_e2p_has_the_published_size_and_the_truth_s0_coded_angle_and_dolp(stores, tmp_path):
+    task = e2p_task(E2P, None, SEED)
+    tensors, metadata = load_checkpoint(run(task, stores, tmp_path, E2P) / "best.safetensors")
+    assert metadata["network"] == "e2p"
+    assert sum(tensor.numel() for tensor in tensors.values()) == 512_501
+    assert metadata["loss"] == {"aolp_mse": 50.0, "aolp_ssim_loss": 1.0, "dolp_mse": 50.0, "dolp_ssim_loss": 1.0}
+    task = e2p_task(E2P, None, SEED)
+    split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
+    batch = stack([split.train[0], split.train[1]])
+    mosaic, truth, valid = task.streams(batch)
+    assert valid is None  # no pixel of these stores is masked
+    windows, _, _, height, width = batch.inputs.shape
+    assert mosaic.shape == (windows, 2, 5, 2 * height, 2 * width)
+    assert torch.equal(mosaic[:, :, :, 1::2, 1::2], batch.inputs[:, :, :5])  # 0 degrees
+    assert torch.equal(truth[:, :, 0], batch.intensity[:, :, 0] + batch.intensity[:, :, 2])
+    assert torch.equal(truth[:, :, 1], coded_aolp(batch.aolp))
+    assert torch.equal(task.scored(truth), batch.dolp)
+
+
+def test_the_loss_is_the_published_one():
+    torch.manual_seed(0)
+    lpips = Lpips("vgg")
+    config = dataclasses.replace(E2P, intensity_lpips=3.0, lpips=1.0)
+    loss = e2p_task(config, lpips, SEED).loss
+    assert isinstance(loss, BranchLoss)
+    predicted, truth = torch.rand(2, 1, 2, 3, 32, 32).unbind()
+    a, b = predicted[0], truth[0]
+    distance = [lpips(a[:, i], b[:, i]).mean() for i in range(3)]
+    polarization = [
+        distance[i] + 50 * (a[:, i] - b[:, i]).square().mean() + (1 - ssim(a[:, i], b[:, i])).mean() for i in (1, 2)
+    ]
+    expected = 3 * distance[0] + sum(polarization)
+    torch.testing.assert_close(loss.total(loss(predicted, truth)), expected, atol=1e-4, rtol=1e-4)
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_a_record_names_its_lpips_settings_and_without_lpips_in_the_loss_no_weights_are_loaded(monkeypatch):
+    for baseline in BASELINES.values():
+        assert set(baseline.lpips) <= set(baseline.config.__dataclass_fields__)
+    loads_nothing = dataclasses.replace(BASELINES["e2v"], lpips=(), task=lambda settings, lpips, seed: lpips)
+    monkeypatch.setattr("polarnet.training.e2v.BASELINE", loads_nothing)
+    _, lpips = train._task(load(ROOT, ["baseline=e2v", "paths.weights=nowhere"]))
+    assert lpips is None

@@ -42,13 +42,10 @@ def test_events_and_frames_of_one_moving_edge_lie_on_each_other(tmp_path, read):
         assert level[row, column + 1] == 20
 
 
-def test_an_event_that_begins_like_a_line_of_the_header_is_an_event(tmp_path, read):
+def test_an_event_may_look_like_a_line_of_the_header_and_times_run_on_when_32_bits_are_full(tmp_path, read):
     first = address(3, 140, 1)
     assert first >> 24 == ord("#")
     assert read(write(tmp_path / "e.aedat", [(first, 5)]))[1][2] == [119]
-
-
-def test_times_run_on_when_32_bits_are_full(tmp_path, read):
     path = write(tmp_path / "e.aedat", [(address(1, 1, 1), t) for t in (2**32 - 5, 2**32 - 1, 3)])
     assert read(path)[1][0] == [2**32 - 5, 2**32 - 1, 2**32 + 3]
 

@@ -32,15 +32,12 @@ def write_esfp(path, triggers=None, **columns):
     return write(path, columns | {"triggers": triggers})
 
 
-def test_dsecs_own_files_begin_at_their_offset_and_need_the_size_of_the_sensor(tmp_path, read):
+def test_dsecs_own_files_begin_at_their_offset_and_may_be_compressed(tmp_path, read):
     path = write_dsec(tmp_path / "e.h5", np.int64(49_599_300_523))
     with pytest.raises(RecordingError, match=r"e\.h5: the file does not say how large the sensor is"):
         read(path)
     _, columns, _ = read(path, height=480, width=640)
     assert columns == [[49_599_300_526, 49_599_300_532], [639, 0], [479, 0], [1, -1]]
-
-
-def test_dsecs_own_compression_is_read(tmp_path, read):
     hdf5plugin = pytest.importorskip("hdf5plugin")
     with h5py.File(tmp_path / "e.h5", "w") as file:
         for name in "txyp":
@@ -51,6 +48,12 @@ def test_dsecs_own_compression_is_read(tmp_path, read):
 def test_e2p_is_a_table_of_t_x_y_p_with_width_before_height(tmp_path, read):
     form, columns, _ = read(write_e2p(tmp_path / "e.h5", [[5, 345, 1, 1], [9, 0, 259, 0]]))
     assert (form, columns) == (("e2p", 260, 346), [[5, 9], [345, 0], [1, 259], [1, -1]])
+    with pytest.raises(RecordingError, match=r"expected events as a table of another shape, got \(1, 3\)"):
+        read(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
+    with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
+        read(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))
+    with pytest.raises(RecordingError, match=r"expected HDF5 of E2P, .*: there is no events"):
+        read(write_dsec(tmp_path / "c.h5"), "e2p")
 
 
 def test_esfp_has_its_columns_at_the_top_of_the_file_and_triggers(tmp_path, read):
@@ -133,15 +136,6 @@ def test_prophesees_own_compression_names_the_plugin_that_it_needs(tmp_path, rea
 def test_other_columns_are_refused_by_name(tmp_path, read, columns, message):
     with pytest.raises(RecordingError, match=rf"e\.h5: .*{message}"):
         read(write_dsec(tmp_path / "e.h5", **columns), height=480, width=640)
-
-
-def test_e2p_of_another_shape_is_refused(tmp_path, read):
-    with pytest.raises(RecordingError, match=r"expected events as a table of another shape, got \(1, 3\)"):
-        read(write_e2p(tmp_path / "a.h5", [[1, 2, 3]]))
-    with pytest.raises(RecordingError, match="expected width and height as sensor_resolution"):
-        read(write_e2p(tmp_path / "b.h5", [[1, 2, 3, 1]], (1, 2, 3)))
-    with pytest.raises(RecordingError, match=r"expected HDF5 of E2P, .*: there is no events"):
-        read(write_dsec(tmp_path / "c.h5"), "e2p")
 
 
 def test_a_damaged_file_is_refused_with_what_hdf5_says(tmp_path, read):

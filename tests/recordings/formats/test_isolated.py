@@ -63,13 +63,10 @@ def process_of():
     return ask_once(LIBRARY, FILE, task("answers"), 1)[1]
 
 
-def test_values_and_arrays_come_from_one_process_that_is_not_ours():
+def test_values_and_arrays_come_from_one_process_that_is_not_ours_also_for_two_tasks_at_a_time():
     (size, process, *_), (*_, numbers, ones) = ask(LIBRARY, FILE, task("answers"), 2)
     assert (size, numbers.tolist(), ones.tolist(), ones.dtype) == (5, [0], [[1, 1]], "int8")
     assert process == process_of() != os.getpid()
-
-
-def test_two_tasks_at_a_time_do_not_disturb_each_other():
     one, two = (ask(LIBRARY, FILE, task("answers"), 3) for _ in range(2))
     sizes = [len(next(answers)[2]) for answers in (one, two, two, one, one, two)]
     assert sizes == [0, 0, 1, 1, 2, 2]
@@ -89,28 +86,22 @@ def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_op
     assert (done.stdout, done.stderr) == ("5\n", "")
 
 
-def test_a_crash_ends_in_a_reason_and_the_next_task_in_a_new_process():
+def test_a_crash_or_an_endless_library_ends_in_a_reason_and_the_next_task_in_a_new_process(monkeypatch):
     before = process_of()
     with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: the library crashed"):
         ask_once(LIBRARY, FILE, task("crash"))
     assert process_of() != before
-
-
-def test_a_file_that_sends_the_library_round_in_circles_is_given_up(monkeypatch):
     process_of()  # the start of a process takes longer
     monkeypatch.setattr(isolated, "PATIENCE_S", 0.2)
     with pytest.raises(RecordingError, match=r"file\.bin: .* took over 0\.2 s"):
         ask_once(LIBRARY, FILE, task("circle"))
 
 
-def test_what_the_library_raises_is_the_reason_and_the_process_stays():
+def test_what_the_library_raises_is_the_reason_and_a_missing_library_is_asked_for():
     before = process_of()
     with pytest.raises(RecordingError, match=r"file\.bin: Fragile cannot read it: Panic: out of bounds; the file is"):
         list(ask(LIBRARY, FILE, task("panic")))
     assert process_of() == before
-
-
-def test_a_library_that_is_not_there_is_asked_for():
     with pytest.raises(RuntimeError, match=r"file\.bin: .* no_such_package: run pip install -e '\.\[recordings\]'"):
         ask_once(LIBRARY._replace(package="no_such_package"), FILE, task("answers"), 1)
 

@@ -1,7 +1,6 @@
 import gzip
 import zipfile
 
-import numpy as np
 import pytest
 
 from polarnet.recordings.recording import read_recording
@@ -87,17 +86,6 @@ def test_text_in_a_gzip_or_zip_archive_is_read_and_a_cut_gzip_up_to_the_cut(tmp_
         RecordingError, match=r"e\.zip: expected one recording in the zip archive, got 2 files; unpack it"
     ):
         read(tmp_path / "e.zip")
-
-
-def test_numbers_are_those_that_numpy_writes(tmp_path, read):
-    generator = np.random.default_rng(0)
-    t = np.sort(generator.integers(0, 10**7, 500)) / 1e6
-    table = np.column_stack([t, generator.integers(0, 18, 500), generator.integers(0, 12, 500), np.ones(500)])
-    np.savetxt(tmp_path / "e.txt", table)
-    _, found, repairs = read(tmp_path / "e.txt", height=12, width=18)
-    assert repairs == {}
-    assert np.array_equal(found[0], np.rint(t * 1e6).astype(np.int64))
-    assert np.array_equal(found[1:3], table[:, 1:3].T)
 
 
 @pytest.mark.parametrize(
