@@ -1,4 +1,4 @@
-"""`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
+"""`polarnet benchmark`: methods on a folder of your own, without training.
 
 Scenes and events of a user's folder stay in `work` of the output: a second run only runs the methods.
 """
@@ -18,9 +18,8 @@ from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.cli.options import CLEANING, cleaning_of, given
-from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.cli.project import project_root, settings_root, working_folder
-from polarnet.cli.studies import STUDIED, run_event_budget
+from polarnet.cli.outputs import WORK, run_folder
+from polarnet.cli.project import settings_root, working_folder
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
@@ -47,33 +46,22 @@ RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarizat
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score methods on a folder or study the pipeline's sequences; print the table or the files."""
-    own = options.scenes or options.recordings
+    """Score methods on a folder and print the table."""
     if options.recordings and options.limit is not None:
         raise ValueError("--limit does not apply to --recordings; leave it out")
     if options.limit is not None and options.limit < 1:
         raise ValueError(f"--limit: expected at least 1, got {options.limit}")
     if not options.recordings and (listed := given(options, ["mosaic", *CLEANING])):
         raise ValueError(f"{listed}: apply to --recordings only; leave it out")
-    settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
-    folder = working_folder()
-    name = own.resolve().name if own else "event_budget"
-    options.out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
+    root, folder, cleaning = (options.scenes or options.recordings).resolve(), working_folder(), cleaning_of(options)
+    options.out = (options.out or folder / "outputs" / "benchmark" / root.name).resolve()
     options.weights = options.weights and options.weights.resolve()
-    root, cleaning = own and own.resolve(), cleaning_of(options)
+    # all cores, and small parts, which share few scenes evenly among them; an override replaces both
+    shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"]
+    chosen = [f"benchmark.methods=[{options.methods}]"] if options.methods else []
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
-        chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
-        # all cores, and small parts, which share few scenes evenly among them; an override replaces both
-        shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"] if own else []
-        config = load(settings, [*shared, *options.overrides, *chosen], folder)
+        config = load(settings_root(), [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
-        if root is None:
-            with run_folder(options.out, "benchmark --event-budget") as study:
-                methods = options.methods.split(",") if options.methods else STUDIED
-                run_event_budget(config, study, methods, options.limit, options.weights)
-            files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
-            print(f"wrote to {options.out}: {', '.join(files)}")
-            return
         notes = _score_folder(options, config, root, cleaning)
     print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")

@@ -361,21 +361,18 @@ def _benchmark(command: AddCommand) -> None:
     benchmark = command(
         "benchmark",
         "benchmark.run",
-        "score every method on your own scenes or recordings, or study the event budget",
+        "score every method on your own scenes or recordings",
         "benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours",
         "benchmark --recordings pdavis/ --hot-pixels found",
-        "benchmark --event-budget --limit 4",
         description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
         "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same on "
-        "recordings of a camera with a polarizer mosaic that hold frames. --event-budget studies the "
-        "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
+        "recordings of a camera with a polarizer mosaic that hold frames. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True).add_argument
     asked("--scenes", type=input_path, metavar="FOLDER", help="photographs or measured polarization, in any depth")
     asked("--recordings", type=input_path, metavar="FOLDER", help="HDF5 of E2P, AEDAT of a DAVIS with frames")
-    asked("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     add = benchmark.add_argument
-    add("--weights", type=input_path, metavar="FILE", help="checkpoint (default: shipped; of studies the pipeline's)")
+    add("--weights", type=input_path, metavar="FILE", help="checkpoint of ours (default: the shipped one)")
     add(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="of --scenes; auto recognises .npz and NAME_0, NAME_45, ... as measured polarization (default: auto)",
@@ -383,8 +380,8 @@ def _benchmark(command: AddCommand) -> None:
     add("--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)")
     _cleaning(benchmark)
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
-    add("--methods", help="separated by commas (default: benchmark.methods; studies have a list of their own)")
-    add("--limit", type=int, metavar="N", help="use only N pictures of --scenes, or N test sequences")
+    add("--methods", help="separated by commas (default: benchmark.methods)")
+    add("--limit", type=int, metavar="N", help="use only N pictures of --scenes")
     _overrides(benchmark)
 
 

@@ -3,12 +3,12 @@
 Figures are returned, not shown; `polarnet.reports.maps.png` and `svg` encode them.
 """
 
-import functools
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import ContextDecorator
 from dataclasses import dataclass
-from typing import Any, ParamSpec
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,8 +19,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from polarnet.reports.maps import DOLP_COLOURS
-
-Arguments = ParamSpec("Arguments")
 
 
 @dataclass(frozen=True)
@@ -42,9 +40,9 @@ VARIABLES = {PAGE.text: "var(--text)", PAGE.quiet: "var(--quiet)", PAGE.grid: "v
 UNUSED_IDS = re.compile(r' id="[A-Za-z0-9]+(?:\.[a-z]+)?_\d+"')  # nothing refers to the names of groups
 
 
-def chart_style(theme: Theme) -> dict[Any, Any]:
-    """matplotlib settings shared by all figures."""
-    return {
+def styled(theme: Theme) -> ContextDecorator:
+    """The style of all figures in the colours of `theme`: a decorator of a function that draws."""
+    settings: dict[Any, Any] = {
         "font.family": "DejaVu Sans",  # comes with matplotlib, so that text looks the same everywhere
         "font.size": 8,
         "text.color": theme.text,
@@ -67,20 +65,7 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
         "legend.frameon": False,
         "legend.fontsize": 7,
     }
-
-
-def styled(theme: Theme) -> Callable[[Callable[Arguments, Figure]], Callable[Arguments, Figure]]:
-    """Decorate a function that draws a figure: it draws in the style of `theme`."""
-
-    def decorate(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-        @functools.wraps(draw)
-        def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
-            with matplotlib.rc_context(chart_style(theme)):
-                return draw(*args, **kwargs)
-
-        return drawn
-
-    return decorate
+    return matplotlib.rc_context(settings)
 
 
 def svg(figure: Figure) -> Markup:

@@ -1,9 +1,8 @@
-"""The paper's Table 2 and its figures 9, 10 and 11 from a run, as files that a text can include."""
+"""The paper's Table 2 and its figures 9 and 10 from a run, as files that a text can include."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -83,30 +82,3 @@ def score_line(recovered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> 
     """MSE and PSNR of one frame, as the text below its picture."""
     error, ratio = (float(score(recovered[None], truth[None])) for score in (mse, psnr))
     return f"{error:.4f} · {ratio:.2f} dB"
-
-
-class Moment(NamedTuple):
-    """A column of Fig. 11: DoLP from the events of one window alone, without a state."""
-
-    t_us: int
-    """Time of the window's last event."""
-    events: int
-    """Mean number of events of a channel."""
-    tensor: Float[Tensor, "h w"]
-    """Event tensor (Eq. 5) of the channel at 0 degrees."""
-    recovered: Float[Tensor, "h w"]
-    truth: Float[Tensor, "h w"]
-
-
-@styled(LIGHT)
-def figure_11(moments: Sequence[Moment]) -> Figure:
-    """Draw event tensors, the DoLP recovered from them and the true DoLP, with t and n above each column."""
-    figure, grid = tile_grid(3, len(moments), moments[0].truth.shape, bar_row=1)
-    for column, moment in zip(grid.T, moments, strict=True):
-        tensor = event_image(moment.tensor, event_full_scale(moment.tensor))
-        for axes, picture in zip(column, (tensor, dolp_image(moment.recovered), dolp_image(moment.truth)), strict=True):
-            show_picture(axes, picture, LIGHT)
-        column[0].set_title(f"t = {moment.t_us / 1000:.1f} ms, n = {moment.events:,}", fontsize=6.5, pad=3)
-    for axes, name in zip(grid[:, 0], ("event tensor", "recovered", "truth"), strict=True):
-        axes.set_ylabel(name, fontsize=6.5)
-    return figure

@@ -130,7 +130,7 @@ def test_a_name_that_is_not_utf_8_is_refused_before_any_work(capsys):
     assert "'camera\\udcff.raw': expected a name in UTF-8; rename the file" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [["preset", "smoke"], ["benchmark", "--event-budget"]])
+@pytest.mark.parametrize("command", [["preset", "smoke"]])
 def test_a_command_on_a_clone_says_so_elsewhere(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     assert main(command) == 1

@@ -8,7 +8,7 @@ from polarnet.events.stream import Events
 from polarnet.reports.artefacts import read_results
 from polarnet.reports.legend import legend_of
 from polarnet.reports.maps import png
-from polarnet.reports.paper import Moment, comparison_figure, figure_11, score_line, write_paper_files
+from polarnet.reports.paper import comparison_figure, score_line, write_paper_files
 from polarnet.reports.recordings import draw_sequence
 from polarnet.storage.frames import Frames
 from polarnet.storage.panels import Panel, Shown, fraction_bytes
@@ -60,13 +60,6 @@ def test_figure_8_has_a_column_for_each_time_and_a_row_for_each_kind(tmp_path):
     assert height == same
     assert three > 1.8 * one
     assert height > 9 * one / 5
-
-
-def test_figure_11_says_when_and_of_how_many_events():
-    maps = torch.rand(12, 18)
-    figure = figure_11([Moment(24_000, 79_191, maps, maps, maps), Moment(35_000, 100_000, maps, maps, maps)])
-    titles = [axes.get_title() for axes in figure.axes]
-    assert titles[:2] == ["t = 24.0 ms, n = 79,191", "t = 35.0 ms, n = 100,000"]
 
 
 def scene(*methods):

@@ -14,7 +14,6 @@ from part_fixtures import files_of
 from PIL import Image
 from simulation_fixtures import REST, STILL
 
-from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
@@ -29,6 +28,7 @@ from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_fr
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
+from studies.robustness import sequence_at
 
 SEQUENCES_PER_PART = 2
 CONFIG = dataclasses.replace(
