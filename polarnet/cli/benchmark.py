@@ -23,8 +23,7 @@ from polarnet.cli.project import settings_root, working_folder
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import NO_RECORD, Weights, find_weights, installed_version
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips, installed_version, record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
@@ -70,8 +69,7 @@ def run(options: argparse.Namespace) -> None:
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     source = "--scenes" if options.scenes else "--recordings"
-    weights, without_lpips = _lpips_weights(config)
-    lpips = None if weights is None else Lpips.of(weights.backbone, weights.tensors)
+    lpips, without_lpips = _lpips(config)
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
     mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
@@ -105,7 +103,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         benchmark = run_benchmark(test_set, context, settings, lpips, mapped)
         details = {
             "set": test_set.name,
-            "lpips": NO_RECORD if weights is None else weights.record,
+            "lpips": record_of(lpips and lpips.backbone),
             "train_mean": context.train_mean,
             "weights": weights_used(methods, context),
             "conditions": {"sentence": about, **used},
@@ -116,15 +114,15 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     return notes
 
 
-def _lpips_weights(config: Config) -> tuple[Weights | None, list[str]]:
-    """Weights of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
+def _lpips(config: Config) -> tuple[Lpips | None, list[str]]:
+    """Network of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
     if not config.benchmark.lpips:
         return None, []
     try:
         installed_version(config.benchmark.lpips_backbone)
     except ValueError as error:
         return None, [f"LPIPS was left out: {error}."]
-    return find_weights(config.benchmark.lpips_backbone), []
+    return Lpips.load(config.benchmark.lpips_backbone), []
 
 
 def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:

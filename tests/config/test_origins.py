@@ -36,7 +36,7 @@ def make_all(run, *scripts: str) -> None:
         make(run(script))
 
 
-SIMULATION = ("ingest", "synthesize", "emulate", "weights")
+SIMULATION = ("ingest", "synthesize", "emulate")
 
 
 def test_equal_values_are_accepted_and_a_changed_one_names_key_both_values_and_the_command(run, tmp_path):
@@ -81,7 +81,7 @@ def test_files_of_a_user_have_no_origin_and_are_accepted(run, tmp_path):
     make_all(run, *SIMULATION)
     row = run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}")
     row.check_inputs()
-    assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr", "data/weights"]
+    assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr"]
 
 
 def test_an_artefact_is_stale_if_it_is_missing_or_of_other_values(run):

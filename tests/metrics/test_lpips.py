@@ -7,7 +7,7 @@ import pytest
 import skimage.data
 import torch
 
-from polarnet.metrics.lpips import BACKBONES, Lpips, find_weights
+from polarnet.metrics.lpips import BACKBONES, Lpips
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "lpips.json").read_text())
 
@@ -22,7 +22,7 @@ def astronaut(blur):
 @pytest.fixture(scope="module", params=["alex", "vgg"])
 def installed(request):
     """LPIPS with the weights that the set-up installs."""
-    return Lpips.of(request.param, find_weights(request.param).tensors)
+    return Lpips.load(request.param)
 
 
 @pytest.mark.parametrize("blur", [3, 7, 15])
@@ -41,7 +41,7 @@ def test_in_bf16_the_distance_is_within_a_percent(installed):
 
 
 def test_the_gradient_is_that_of_finite_differences(installed):
-    lpips = Lpips.of(installed.backbone, find_weights(installed.backbone).tensors).double()
+    lpips = Lpips.load(installed.backbone).double()
     sharp, blurred = (image[..., :40, :40].double() for image in astronaut(7))
     blurred.requires_grad_()
     lpips(blurred, sharp).sum().backward()

