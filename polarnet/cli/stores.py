@@ -40,7 +40,7 @@ def inspect(options: argparse.Namespace) -> None:
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
-    inspection = inspect_recording(open_recording(file, part=options.part, **reading_of(options)), HOT_FACTOR)
+    inspection = inspect_recording(open_recording(file, **reading_of(options)), HOT_FACTOR)
     print(*findings(inspection), sep="\n")
     folder = options.out or Path("outputs", "inspect")
     folder.mkdir(parents=True, exist_ok=True)
@@ -66,7 +66,7 @@ def view(options: argparse.Namespace) -> None:
 
 
 def _written_page(options: argparse.Namespace) -> Path:
-    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
+    open_file = functools.partial(open_recording, **reading_of(options))
     if is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
         films = [recording_film(options.path, open_file)]
