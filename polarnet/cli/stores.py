@@ -17,7 +17,7 @@ from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
-from polarnet.reports.recordings import draw_hot_pixels, recording_picture
+from polarnet.reports.recordings import recording_picture
 from polarnet.reports.viewing import films_of, recording_film
 from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
@@ -47,10 +47,8 @@ def inspect(options: argparse.Namespace) -> None:
     (folder / f"{file.name}.png").write_bytes(recording_picture(inspection))
     print(f"picture     {folder / file.name}.png")
     if inspection.hot.any():
-        draw_hot_pixels(inspection.counts, inspection.hot, folder / f"{file.name}.hot.png")
         write_hot_pixels(folder / f"{file.name}.hot.txt", inspection.hot)
-        print(f"hot pixels  {folder / file.name}.hot.png")
-        print(f"list        {folder / file.name}.hot.txt, for --hot-pixels")
+        print(f"hot pixels  {folder / file.name}.hot.txt, for --hot-pixels")
 
 
 def view(options: argparse.Namespace) -> None:
