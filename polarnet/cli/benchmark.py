@@ -17,7 +17,7 @@ from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
-from polarnet.cli.options import CLEANING, cleaning_of, given
+from polarnet.cli.options import CLEANING, cleaning_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.config.pipeline import context_of, made_set
@@ -46,12 +46,9 @@ RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarizat
 
 def run(options: argparse.Namespace) -> None:
     """Score methods on a folder and print the table."""
-    if options.recordings and options.limit is not None:
-        raise ValueError("--limit does not apply to --recordings; leave it out")
+    refuse(options, *(("--recordings", ["limit"]) if options.recordings else ("--scenes", ["mosaic", *CLEANING])))
     if options.limit is not None and options.limit < 1:
         raise ValueError(f"--limit: expected at least 1, got {options.limit}")
-    if not options.recordings and (listed := given(options, ["mosaic", *CLEANING])):
-        raise ValueError(f"{listed}: apply to --recordings only; leave it out")
     root, folder, cleaning = (options.scenes or options.recordings).resolve(), working_folder(), cleaning_of(options)
     options.out = (options.out or folder / "outputs" / "benchmark" / root.name).resolve()
     options.weights = options.weights and options.weights.resolve()

@@ -218,7 +218,6 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     add("--upsample", action="store_true", help="interpolate frames so that nothing moves by more than 1 px a step")
     add("--grey", action="store_true", help="take colour frames as grey, which are unpolarized")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels of raw frames: even row / odd row")
-    add("--angles", nargs=4, type=int, metavar="DEG", help="angles of four videos (default: from their names)")
     add(
         "--white", type=float, metavar="LEVEL", help="level of saturation (default: the most of the first frame's bits)"
     )
@@ -232,12 +231,12 @@ def _inspect(command: AddCommand) -> None:
         "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
         "inspect recording.aedat4",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs, and "
+        "camera's file, with its longest gap and empty rows. Draws its busiest moment as a PNG, and "
         "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
     )
     inspect.add_argument("file", type=input_name, help="file of a camera, or a store to list")
     _reading(inspect)
-    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
+    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of these files (default: outputs/inspect)")
 
 
 def _recover(command: AddCommand) -> None:

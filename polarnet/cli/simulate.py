@@ -59,9 +59,9 @@ def simulate(options: argparse.Namespace) -> None:
     _check(options, inputs, overrides, formats)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
-    clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, size))
+    clip = open_clip(inputs, ClipOptions(mosaic, options.white, options.grey, size))
     unused = ["times", "fps", "size", "upsample"] if clip.still else []
-    unused += ["grey" if clip.measured else "white", "mosaic" if len(inputs) == 4 else "angles"]
+    unused += ["grey" if clip.measured else "white", *(["mosaic"] if len(inputs) == 4 else [])]
     refuse(options, "a single frame" if clip.still else clip.words, unused)
     times = None if clip.still else timed(options, clip, inputs[0])
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
