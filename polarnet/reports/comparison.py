@@ -24,8 +24,7 @@ def comparison_figure(panels: Sequence[Panel], legend: Legend = GENERAL) -> Figu
     """
     methods = with_structure(panels[0].predictions)
     headings = ["events, 0°", "true DoLP", *(textwrap.fill(legend.label(one), HEADING_LETTERS) for one in methods)]
-    lines = max(1 + heading.count("\n") for heading in headings)
-    figure, grid = tile_grid(len(panels), len(headings), panels[0].s0.shape, heading_lines=lines)
+    figure, grid = tile_grid(len(panels), len(headings), panels[0].s0.shape)
     for panel, row in zip(panels, grid, strict=True):
         tiles = [(event_image(panel.events[0], event_full_scale(panel.events)), ""), (dolp_image(panel.truth.dolp), "")]
         shown = [panel.predictions[method].dolp for method in methods]

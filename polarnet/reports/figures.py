@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from polarnet.reports.maps import DOLP_COLOURS
 
@@ -80,20 +81,14 @@ def svg(figure: Figure) -> Markup:
     return Markup(drawing)
 
 
-def tile_grid(
-    rows: int, columns: int, shape: Sequence[int], bar_row: int = 0, heading_lines: int = 1
-) -> tuple[Figure, np.ndarray]:
+def tile_grid(rows: int, columns: int, shape: Sequence[int], bar_row: int = 0) -> tuple[Figure, np.ndarray]:
     """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside row `bar_row`."""
-    tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.12 + 0.14 * heading_lines, 0.2  # inches
-    tile_height = tile * shape[0] / shape[1]
-    width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
-    figure = Figure(figsize=(width, height), facecolor=LIGHT.face)
+    tile, label = 1.4, 0.15  # inches
+    size = columns * tile + 0.7, rows * (tile * shape[0] / shape[1] + label) + 2 * label
+    layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+    figure = Figure(figsize=size, facecolor=LIGHT.face, layout=layout)
     grid = figure.subplots(rows, columns, squeeze=False)
-    figure.subplots_adjust(
-        left / width, below / height, 1 - (right + gap) / width, 1 - top / height, gap / tile, below / tile_height
-    )
-    place = grid[bar_row, -1].get_position()
-    bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
+    bar = grid[bar_row, -1].inset_axes((1.05, 0, 0.07, 1))
     colours = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=bar, ticks=[0, 0.5, 1])
     colours.ax.tick_params(labelsize=6, length=2, pad=2, colors=LIGHT.quiet)
     colours.outline.set_visible(False)
