@@ -17,7 +17,7 @@ from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.recordings import recording_picture
-from polarnet.reports.viewing import films_of, recording_film
+from polarnet.reports.viewing import films_of
 from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, SplitStore
@@ -62,13 +62,12 @@ def view(options: argparse.Namespace) -> None:
 
 
 def _written_page(options: argparse.Namespace) -> Path:
-    open_file = functools.partial(open_recording, **reading_of(options))
     if is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
-        films = [recording_film(options.path, open_file)]
     else:
         refuse(options, "a store or a folder", ["part", *READING])
-        films = films_of(options.path, options.sequence or ())
+    open_file = functools.partial(open_recording, **reading_of(options))
+    films = films_of(options.path, options.sequence or (), open_file)
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)
     return write_player(page, f"{options.path}", films, {"command": options.command_line})

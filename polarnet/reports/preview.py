@@ -37,6 +37,7 @@ from polarnet.terminal.progress import ProgressBar
 CODEC, PIXELS = "libx264", "yuv420p"  # the one pair that every browser plays
 QUALITY = {"preset": "ultrafast", "crf": "18", "threads": "1"}  # a second thread would take the network's core
 LAYOUT = {"movflags": "hybrid_fragmented", "flush_packets": "1"}  # plays after a kill, an ordinary MP4 once closed
+PICTURES_PER_SECOND = 30.0
 SECONDS_PER_FRAGMENT = 2  # the most that a kill loses
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
 GAP, MARGIN = 8, 12
@@ -173,9 +174,9 @@ class Sheet:
 
 
 def write_true_video(
-    path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
+    path: Path, channels: Sequence[Events], truth: TrueFrames, gamma: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Write a picture (`Sheet.truth`) of each two true frames as a video, with a progress bar.
+    """Write a picture (`Sheet.truth`) of each two true frames as a video of 30 a second, with a progress bar.
 
     Returns the picture with most events, None if there is none.
 
@@ -192,7 +193,7 @@ def write_true_video(
     dtype('uint8')
     """
     sheet, busiest, most = Sheet(channels[0].height, channels[0].width), None, -1
-    with VideoWriter(path, rate_hz) as video:
+    with VideoWriter(path, PICTURES_PER_SECOND) as video:
         for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
             span = int(truth.t_us[k - 1]), int(truth.t_us[k])
             window = [slice_time(events, *span) for events in channels]

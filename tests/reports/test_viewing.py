@@ -40,10 +40,9 @@ def test_times_of_a_recording_count_from_its_first_event(tmp_path):
     assert (film.t_us[0], film.t_us[-1]) == (10, 241)
 
 
-@pytest.mark.parametrize(("name", "message"), [("", "found none"), ("nowhere", "no such path")])
-def test_a_path_without_anything_to_show_is_refused(tmp_path, name, message):
-    with pytest.raises(FileNotFoundError, match=message):
-        films_of(tmp_path / name)
+def test_a_path_without_anything_to_show_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="found none"):
+        films_of(tmp_path)
 
 
 def test_the_command_writes_a_page_of_the_sequences_asked_for(data, tmp_path):
