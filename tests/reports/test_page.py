@@ -148,7 +148,7 @@ def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(path
     shutil.copytree(paths.simulated, folder)
     notes = ["e2vid was left out: run `dvc repro`."]
     set_page = write_set_page(folder, "my <holidays>", "polarnet benchmark --scenes x", notes).read_text()
-    assert (folder / "comparison_simulated.png").exists()
+    assert (folder / "comparison_results.png").exists()
     for text in (
         "my &lt;holidays&gt;", "15.56", "oracle mean", "<dt>E2V: FireNet</dt>",
         "<dt>ours: the paper&#39;s network</dt><dd>best.safetensors (sha256 5ca1ab1e5ca1ab1e)</dd>",
