@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
 from polarnet.training.engine.loop import LoopConfig, train
@@ -27,7 +27,7 @@ def main(config: Config) -> None:
     settings, task = or_exit(lambda: _task(config))
     paths = config.paths
     split = open_split(EventStore.open(paths.events), paths.frames, task.encode)
-    metadata = describe(task, split, settings, Path(paths.weights), config.seed, device)
+    metadata = describe(task, split, settings, config.lpips.backbone, config.seed, device)
     recorder = Recorder(Path(paths.train) / (config.baseline or DOLP_TRAINING), Path(paths.resume), metadata)
     train(task, split, settings, recorder, config.seed, device, config.runtime.workers)
 
@@ -36,7 +36,7 @@ def _task(config: Config) -> tuple[LoopConfig, Task]:
     """Settings and task of the training; ValueError if LPIPS weights that it needs are missing."""
 
     def lpips(weight: float) -> Lpips | None:
-        return Lpips.load(config.paths.weights, "loss", config.lpips.backbone) if weight > 0 else None
+        return Lpips.load(config.lpips.backbone) if weight > 0 else None
 
     tasks = import_module(f"polarnet.training.{config.baseline or 'dolp'}")
     if config.baseline is None:

@@ -96,17 +96,17 @@ def _plan(run: Run) -> tuple[list[Stage], list[str]]:
     wanted = {f"benchmark@{row}" for row in run.config.benchmark.methods} | {"train"}
     for stage in reversed(run.pipeline.values()):
         if stage.name in wanted:
-            wanted |= {run.maker_of(dep).name for dep in stage.deps if run.is_made(dep)}
+            wanted |= {maker.name for dep in stage.deps if (maker := run.maker_of(dep))}
     plan: list[Stage] = []
     inputs: dict[str, None] = {}
     for stage in run.pipeline.values():
         if stage.name not in wanted:
             continue
-        made = [dep for dep in stage.deps if run.is_made(dep)]
-        follows = any(run.maker_of(dep) in plan for dep in made)
+        made = {dep: maker for dep in stage.deps if (maker := run.maker_of(dep))}
+        follows = any(maker in plan for maker in made.values())
         if follows or stage.name.partition("@")[0] in OWN or run.is_stale(stage):
             plan.append(stage)
-            inputs |= dict.fromkeys(dep for dep in made if run.maker_of(dep) not in plan)
+            inputs |= dict.fromkeys(dep for dep, maker in made.items() if maker not in plan)
     return plan, list(inputs)
 
 

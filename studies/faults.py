@@ -35,7 +35,6 @@ from polarnet.benchmark.results import read_record, read_rows
 from polarnet.config.origins import Run
 from polarnet.config.tree import load
 from polarnet.events.stream import Events
-from polarnet.metrics.lpips import Lpips, stored_record
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.pictures.images import read_rgb
 from polarnet.pictures.manifest import read_manifest
@@ -83,9 +82,6 @@ def values_of(kind: str, folder: Path) -> str:
     if kind == "training":
         tensors, metadata = load_checkpoint(folder / "best.safetensors")
         return digest(metadata, read_history(folder), *((name, tensors[name]) for name in sorted(tensors)))
-    if kind == "LPIPS":
-        backbone = stored_record(folder, "benchmark")["backbone"]
-        return digest(*Lpips.load(folder, "benchmark", backbone or "").state_dict().values())
     if kind == "row":
         sets = sorted(path.name for path in folder.iterdir() if path.is_dir())
         return digest(read_record(folder), *(read_rows({folder.name: folder}, one) for one in sets))
@@ -100,7 +96,6 @@ PLACES = {
     "images": "images",
     "training": "train/*",
     "row": "benchmark/rows/*",
-    "LPIPS": "weights",
 }
 """Folders of each kind of artefact, below `paths.data`."""
 
@@ -294,7 +289,7 @@ def kills(cases: int) -> dict[str, dict[str, int]]:
 
 NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
 NAMES += ["b\x00", "b\n", "b\u202e", "b\u2028"]
-COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
+COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"]}
 """Commands that read a store whole, and what follows its name."""
 
 

@@ -144,9 +144,8 @@ def prepare(run_folder: Path, scratch: Path) -> None:
     for words in COMMANDS.values():
         words[1][:] = [word.replace("FIRST", first).replace("LAST", last) for word in words[1]]
     sys.path.insert(0, str(scratch))  # so that the stages are those of the project, with its settings
-    for name in ("row", "train", "trial", "weights"):
+    for name in ("row", "train", "trial"):
         importlib.import_module(f"stages.{name}")
-    start(["stages.weights"], scratch / "output").join()  # the short trainings need none
     torch.set_num_threads(1)
 
 

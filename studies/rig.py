@@ -20,7 +20,7 @@ from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.writers import write_hdf5
-from polarnet.reports.recordings import draw_calibration, draw_hot_pixels, recording_picture
+from polarnet.reports.recordings import draw_calibration, recording_picture
 from polarnet.simulation.scene import scene_from_rgb
 from studies.simulated_rig import RigConfig, write_rig
 from studies.simulation_pictures import few_colours
@@ -60,7 +60,6 @@ def main() -> None:
         assert recordings.hot_pixel_factor is not None
         inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
     (PICTURES / "recordings_inspect.png").write_bytes(recording_picture(inspection))
-    draw_hot_pixels(inspection.counts, inspection.hot, PICTURES / "recordings_hot_pixels.png")
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
     (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"text": "\n".join(lines)}, indent=2) + "\n")
     for path in PICTURES.glob("recordings_*.png"):

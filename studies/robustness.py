@@ -27,20 +27,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Int64
+from torch import Tensor
 
-from polarnet.analysis.event_budget import sequence_at
 from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
+from polarnet.events.stream import Events
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure
+from polarnet.simulation.camera import grid
 from polarnet.simulation.dataset import motion_over
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.stokes import Prediction
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
@@ -156,6 +160,17 @@ def scored_sequence(
     }
     truth = test.dolp[first:] if valid is None else test.dolp[first:][valid]
     return Scores(scores, {test.scene: float(truth.mean())}, errors)
+
+
+def sequence_at(scenes: SceneStore, name: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
+    """Events of a stored sequence, with exact truth at the window boundaries `t_us`."""
+    scene, trajectory, _ = motion_over(scenes, name)
+    pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    intensity, dolp, aolp = (frames[1:] for frames in frames_of(scene, trajectory, t_us.tolist(), *pixels))
+    mask, crosstalk = scenes.read(name).valid if scenes.masked else None, scenes.attributes.get("crosstalk", 0.0)
+    valid = None if mask is None else valid_frames(mask, trajectory, t_us.tolist()[1:], pixels, crosstalk)
+    s0 = intensity[:, 0] + intensity[:, 2]
+    return TestSequence(name, scenes.scene_of[name], events, t_us, dolp, aolp, s0, valid)
 
 
 def simulated(scenes: SceneStore, name: str, config: Config) -> TestSequence:

@@ -1,1 +1,1 @@
-"""Beyond the scores of a method: event budget, conditions of a comparison, recordings with truth."""
+"""Conditions of a comparison, and recordings with truth as a test set."""

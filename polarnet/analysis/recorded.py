@@ -1,7 +1,7 @@
 """Recordings with true polarization as a test set: stores of events and frames, and a check of their common clock."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from polarnet.events.streaming import TRAINED_WINDOW_US
 from polarnet.recordings.arrangements import Piece, shifted
 from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
-from polarnet.recordings.recording import Recording, detect_format, read_recording
+from polarnet.recordings.recording import detect_format, read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import Truth, read_truth, truth_formats
 from polarnet.stokes import Mosaic
@@ -38,13 +38,7 @@ class Recorded(NamedTuple):
     """Warnings about its clock and its noise, a sentence each."""
 
 
-def make_recorded_set(
-    root: Path,
-    folder: Path,
-    mosaic: Mosaic,
-    cleaning: Cleaning,
-    read: Callable[[Path], Recording] = read_recording,
-) -> list[str]:
+def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleaning) -> list[str]:
     """Write every recording with frames under `root` into `folder` as events.zarr and frames.zarr; returns notes.
 
     All sequences are in the split test, one scene each. ValueError if there is no recording with frames, or if they
@@ -58,7 +52,7 @@ def make_recorded_set(
         try:
             if detect_format(path) not in truth_formats():
                 raise RecordingError(f"expected a format with frames, {', '.join(truth_formats())}")
-            recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning, read))
+            recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning))
         except RecordingError as error:
             notes.append(f"{path.name} was skipped: {str(error).removeprefix(f'{path.name}: ')}.")
     if not recordings:
@@ -72,15 +66,13 @@ def make_recorded_set(
     return [*notes, *(note for one in recordings for note in one.notes)]
 
 
-def read_recorded(
-    path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning, read: Callable[[Path], Recording] = read_recording
-) -> Recorded:
+def read_recorded(path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning) -> Recorded:
     """The four channels of a recording, without noise, and its frames; both last from the first frame to the last.
 
     Frames more than one interval before the first event or after the last are left out. RecordingError if fewer than
     three remain, as with different clocks, or if frames and sensor differ in size.
     """
-    events, truth = read(path).events, read_truth(path, mosaic)
+    events, truth = read_recording(path).events, read_truth(path, mosaic)
     if truth.light.shape[1:] != (events.height // 2 * 2, events.width // 2 * 2):
         raise RecordingError(
             f"{path.name}: expected frames of the sensor's {events.height}x{events.width} px, got "

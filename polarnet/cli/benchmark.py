@@ -1,4 +1,4 @@
-"""`polarnet benchmark`: methods on a folder of your own, without training, or in studies of the pipeline's sequences.
+"""`polarnet benchmark`: methods on a folder of your own, without training.
 
 Scenes and events of a user's folder stay in `work` of the output: a second run only runs the methods.
 """
@@ -17,15 +17,13 @@ from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, metadata_used, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
-from polarnet.cli.options import CLEANING, cleaning_of, given
-from polarnet.cli.outputs import MARKER, WORK, run_folder
-from polarnet.cli.project import project_root, settings_root, working_folder
-from polarnet.cli.studies import STUDIED, run_event_budget
+from polarnet.cli.options import CLEANING, cleaning_of, refuse
+from polarnet.cli.outputs import WORK, run_folder
+from polarnet.cli.project import settings_root, working_folder
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import NO_RECORD, Weights, find_weights, installed_version
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips, installed_version, record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
@@ -47,33 +45,19 @@ RECORDED_SENTENCE = "Windows lie between the recordings' frames, whose polarizat
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score methods on a folder or study the pipeline's sequences; print the table or the files."""
-    own = options.scenes or options.recordings
-    if options.recordings and options.limit is not None:
-        raise ValueError("--limit does not apply to --recordings; leave it out")
+    """Score methods on a folder and print the table."""
+    refuse(options, *(("--recordings", ["limit"]) if options.recordings else ("--scenes", ["mosaic", *CLEANING])))
     if options.limit is not None and options.limit < 1:
         raise ValueError(f"--limit: expected at least 1, got {options.limit}")
-    if not options.recordings and (listed := given(options, ["mosaic", *CLEANING])):
-        raise ValueError(f"{listed}: apply to --recordings only; leave it out")
-    settings = settings_root() if own else project_root()  # a study needs the pipeline's test sequences
-    folder = working_folder()
-    name = own.resolve().name if own else "event_budget"
-    options.out = (options.out or folder / "outputs" / "benchmark" / name).resolve()
+    root, folder, cleaning = (options.scenes or options.recordings).resolve(), working_folder(), cleaning_of(options)
+    options.out = (options.out or folder / "outputs" / "benchmark" / root.name).resolve()
     options.weights = options.weights and options.weights.resolve()
-    root, cleaning = own and own.resolve(), cleaning_of(options)
+    # all cores, and small parts, which share few scenes evenly among them; an override replaces both
+    shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"]
+    chosen = [f"benchmark.methods=[{options.methods}]"] if options.methods else []
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
-        chosen = [f"benchmark.methods=[{options.methods}]"] if own and options.methods else []
-        # all cores, and small parts, which share few scenes evenly among them; an override replaces both
-        shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"] if own else []
-        config = load(settings, [*shared, *options.overrides, *chosen], folder)
+        config = load(settings_root(), [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
-        if root is None:
-            with run_folder(options.out, "benchmark --event-budget") as study:
-                methods = options.methods.split(",") if options.methods else STUDIED
-                run_event_budget(config, study, methods, options.limit, options.weights)
-            files = sorted(path.name for path in options.out.iterdir() if path.name != MARKER)
-            print(f"wrote to {options.out}: {', '.join(files)}")
-            return
         notes = _score_folder(options, config, root, cleaning)
     print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")
@@ -82,8 +66,7 @@ def run(options: argparse.Namespace) -> None:
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     source = "--scenes" if options.scenes else "--recordings"
-    weights, without_lpips = _lpips_weights(config)
-    lpips = None if weights is None else Lpips.of(weights.backbone, weights.tensors)
+    lpips, without_lpips = _lpips(config)
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
     mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
@@ -117,7 +100,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         benchmark = run_benchmark(test_set, context, settings, lpips, mapped)
         details = {
             "set": test_set.name,
-            "lpips": NO_RECORD if weights is None else weights.record,
+            "lpips": record_of(lpips and lpips.backbone),
             "train_mean": context.train_mean,
             "weights": weights_used(methods, context),
             "conditions": {"sentence": about, **used},
@@ -128,15 +111,15 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     return notes
 
 
-def _lpips_weights(config: Config) -> tuple[Weights | None, list[str]]:
-    """Weights of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
+def _lpips(config: Config) -> tuple[Lpips | None, list[str]]:
+    """Network of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
     if not config.benchmark.lpips:
         return None, []
     try:
         installed_version(config.benchmark.lpips_backbone)
     except ValueError as error:
         return None, [f"LPIPS was left out: {error}."]
-    return find_weights(config.benchmark.lpips_backbone), []
+    return Lpips.load(config.benchmark.lpips_backbone), []
 
 
 def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:

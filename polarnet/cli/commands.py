@@ -155,22 +155,6 @@ def _stores(command: AddCommand) -> None:
     verify.add_argument(
         "store", type=input_name, help="store or its URL, checkpoint (.safetensors), running.pt, folder"
     )
-    video = command(
-        "video",
-        "stores.video",
-        "draw a stored sequence and its truth as a video that browsers play",
-        "video outputs/simulate/lake/events.zarr",
-        "video data/events.zarr lake-0 --out lake.mp4",
-        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
-        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
-        "predictions.",
-    )
-    video.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
-    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
-    video.add_argument(
-        "--truth", type=input_name, metavar="FRAMES", help="true frames (default: those beside the store)"
-    )
-    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
     replay = command(
         "replay",
         "stores.replay",
@@ -218,7 +202,6 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     add("--upsample", action="store_true", help="interpolate frames so that nothing moves by more than 1 px a step")
     add("--grey", action="store_true", help="take colour frames as grey, which are unpolarized")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels of raw frames: even row / odd row")
-    add("--angles", nargs=4, type=int, metavar="DEG", help="angles of four videos (default: from their names)")
     add(
         "--white", type=float, metavar="LEVEL", help="level of saturation (default: the most of the first frame's bits)"
     )
@@ -232,12 +215,12 @@ def _inspect(command: AddCommand) -> None:
         "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
         "inspect recording.aedat4",
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
-        "camera's file, with its longest gap and empty rows. Draws its busiest moment and its hot pixels as PNGs, and "
+        "camera's file, with its longest gap and empty rows. Draws its busiest moment as a PNG, and "
         "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
     )
     inspect.add_argument("file", type=input_name, help="file of a camera, or a store to list")
     _reading(inspect)
-    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the PNGs (default: outputs/inspect)")
+    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of these files (default: outputs/inspect)")
 
 
 def _recover(command: AddCommand) -> None:
@@ -365,21 +348,18 @@ def _benchmark(command: AddCommand) -> None:
     benchmark = command(
         "benchmark",
         "benchmark.run",
-        "score every method on your own scenes or recordings, or study the event budget",
+        "score every method on your own scenes or recordings",
         "benchmark --scenes photographs/ --limit 10 --methods cf,highpass,ours",
         "benchmark --recordings pdavis/ --hot-pixels found",
-        "benchmark --event-budget --limit 4",
         description="--scenes simulates event sequences from the pictures of a folder, runs every method whose weights "
         "are available, prints the table and writes it with a page; it trains nothing. --recordings does the same on "
-        "recordings of a camera with a polarizer mosaic that hold frames. --event-budget studies the "
-        "pipeline's own test sequences. params.yaml sets sizes, motion and sensor.",
+        "recordings of a camera with a polarizer mosaic that hold frames. params.yaml sets sizes, motion and sensor.",
     )
     asked = benchmark.add_mutually_exclusive_group(required=True).add_argument
     asked("--scenes", type=input_path, metavar="FOLDER", help="photographs or measured polarization, in any depth")
     asked("--recordings", type=input_path, metavar="FOLDER", help="HDF5 of E2P, AEDAT of a DAVIS with frames")
-    asked("--event-budget", action="store_true", help="quality against events per pixel (paper, Fig. 11)")
     add = benchmark.add_argument
-    add("--weights", type=input_path, metavar="FILE", help="checkpoint (default: shipped; of studies the pipeline's)")
+    add("--weights", type=input_path, metavar="FILE", help="checkpoint of ours (default: the shipped one)")
     add(
         "--kind", choices=("auto", "photographs", "polarization"), default="auto",
         help="of --scenes; auto recognises .npz and NAME_0, NAME_45, ... as measured polarization (default: auto)",
@@ -387,8 +367,8 @@ def _benchmark(command: AddCommand) -> None:
     add("--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)")
     _cleaning(benchmark)
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
-    add("--methods", help="separated by commas (default: benchmark.methods; studies have a list of their own)")
-    add("--limit", type=int, metavar="N", help="use only N pictures of --scenes, or N test sequences")
+    add("--methods", help="separated by commas (default: benchmark.methods)")
+    add("--limit", type=int, metavar="N", help="use only N pictures of --scenes")
     _overrides(benchmark)
 
 

@@ -49,7 +49,7 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     start_us, stop_us = duration_us(options, "start", "500ms") or 0, duration_us(options, "stop", "500ms")
     if stop_us is not None and stop_us <= start_us:
         raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us")
-    reader = open_recording(file, part=options.part, **reading_of(options))
+    reader = open_recording(file, **reading_of(options))
     span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
         FORMS[form][1](temporary, span.chunks(reader), None)

@@ -39,8 +39,7 @@ def run(options: argparse.Namespace) -> None:
 
     paths = [*([options.static] if options.static else []), *(options.flicker or [])]
     recordings = [
-        read_recording(path, part=options.part, **reading_of(options)).events
-        for path in ProgressBar(paths, "read", unit="recording")
+        read_recording(path, **reading_of(options)).events for path in ProgressBar(paths, "read", unit="recording")
     ]
     static = recordings.pop(0) if options.static else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light

@@ -14,8 +14,8 @@ CLEANING = ("hot_pixels", "background")
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of `READING`."""
-    return {name: getattr(options, name) for name in READING}
+    """Values of `READING` and --part, as arguments of `open_recording`."""
+    return {name: getattr(options, name) for name in ("part", *READING)}
 
 
 def cleaning_of(options: argparse.Namespace) -> Cleaning:

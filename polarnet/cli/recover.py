@@ -108,7 +108,7 @@ def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | Non
     if options.rotating is None and options.triggers is None:
         return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
-    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
+    open_file = functools.partial(open_recording, **reading_of(options))
     source, rotation = open_rotating(Path(options.input[0]), rotation, open_file, options.size)
     return source, rotation, half_turn_rule(rotation, step_us)
 
@@ -119,7 +119,7 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
         return open_live(options.input[0], mosaic, options.idle, cleaner)
     method = METHODS.get(options.method)
     plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
-    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
+    open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
     files = Files(paths, options.angles, mosaic, options.sequence, plain, open_file, config.recordings)
     return open_files(files, work, options.size, cleaner)

@@ -2,12 +2,13 @@
 
 import argparse
 import contextlib
+import itertools
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 import torch
 
@@ -29,6 +30,8 @@ from polarnet.simulation.upsampling import StokesFrame
 from polarnet.stokes import parse_mosaic
 
 PHOTOGRAPH = "astronaut"
+Timed: TypeAlias = Iterator[tuple[ClipFrame | None, float | None]]
+"""Frames with times in microseconds, which may start at any time; None where there are more of the others."""
 
 
 def demo(options: argparse.Namespace) -> int:
@@ -56,11 +59,11 @@ def simulate(options: argparse.Namespace) -> None:
     _check(options, inputs, overrides, formats)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
-    clip = open_clip(inputs, ClipOptions(mosaic, options.angles, options.white, options.grey, size))
+    clip = open_clip(inputs, ClipOptions(mosaic, options.white, options.grey, size))
     unused = ["times", "fps", "size", "upsample"] if clip.still else []
-    unused += ["grey" if clip.measured else "white", "mosaic" if len(inputs) == 4 else "angles"]
+    unused += ["grey" if clip.measured else "white", *(["mosaic"] if len(inputs) == 4 else [])]
     refuse(options, "a single frame" if clip.still else clip.words, unused)
-    times = None if clip.still else _times_of(options, clip, inputs[0])
+    times = None if clip.still else timed(options, clip, inputs[0])
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         config = load(settings_root(), overrides, folder)
@@ -83,16 +86,6 @@ def simulate(options: argparse.Namespace) -> None:
     print(f"folder      {out}")
 
 
-class Times(NamedTuple):
-    """Times of a clip's frames."""
-
-    source: str
-    of: Callable[[int, ClipFrame], float]
-    """Time in microseconds of a frame, by its number; it may start at any time."""
-    number: int | None = None
-    """Number of times; None: as many as frames."""
-
-
 def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str], formats: list[str]) -> None:
     if unknown := [form for form in formats if form not in FORMATS]:
         raise ValueError(f"--to: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
@@ -108,24 +101,7 @@ def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str]
         raise ValueError("--times, --fps: expected one of them, got both; leave one out")
 
 
-def _times_of(options: argparse.Namespace, clip: Clip, path: Path) -> Times:
-    if options.fps:
-        return Times("--fps", lambda number, frame: number * 1e6 / options.fps)
-    stated = path / TIMES_FILE
-    file = options.times or (stated if stated.is_file() else None)
-    if file is None and path.is_dir():
-        raise ValueError(f"{path.name}: expected the times of the frames; give --fps HZ, --times FILE, or {stated}")
-    if file is None:
-        return Times(path.name, lambda number, frame: frame.t_us or 0.0)
-    t_us = check_times(times_from_file(file, options.time_unit), file.name)
-    if clip.count is not None and len(t_us) != clip.count:
-        raise ValueError(
-            f"{file.name}: expected a time for each of {clip.count} frames, got {len(t_us)}; write one line a frame"
-        )
-    return Times(file.name, lambda number, frame: int(t_us[number]), len(t_us))
-
-
-def _run(config: Config, clip: Clip, times: Times | None, output: Output) -> dict[str, str]:
+def _run(config: Config, clip: Clip, times: tuple[str, Timed] | None, output: Output) -> dict[str, str]:
     """Simulate and return the facts to print."""
     threads, saturation = threads_of(config.runtime), [0.0]
     total: int | None
@@ -135,7 +111,7 @@ def _run(config: Config, clip: Clip, times: Times | None, output: Output) -> dic
         output.attributes["synthesize"] = vars(motion)
         camera, total = config.camera.drawn(config.seed, "picture"), len(frame_times_us(motion))
     else:
-        frames = timed_frames(clip, times, saturation)
+        frames = _from_zero(clip, *times, saturation)
         pieces = video_pieces(frames, config.camera, config.seed, output.attributes["upsample"], threads)
         camera, total = config.camera.drawn(config.seed, "video"), clip.count
     facts, notes = write_simulation(pieces, camera, total, output)
@@ -165,25 +141,41 @@ def _polarized(clip: Clip, frame: ClipFrame) -> PolarizationScene:
     return scene_from_light(planes) if clip.light else scene_from_rgb(planes)
 
 
-def timed_frames(clip: Clip, times: Times, saturation: list[float]) -> Iterator[StokesFrame]:
+def timed(options: argparse.Namespace, clip: Clip, path: Path) -> tuple[str, Timed]:
+    """Source of a clip's times, for messages, and the frames with their times; ValueError for times that do not fit."""
+    if options.fps:
+        return "--fps", ((frame, number * 1e6 / options.fps) for number, frame in enumerate(clip.frames()))
+    stated = path / TIMES_FILE
+    file = options.times or (stated if stated.is_file() else None)
+    if file is None and path.is_dir():
+        raise ValueError(f"{path.name}: expected the times of the frames; give --fps HZ, --times FILE, or {stated}")
+    if file is None:
+        return path.name, ((frame, frame.t_us or 0.0) for frame in clip.frames())
+    t_us = check_times(times_from_file(file, options.time_unit), file.name)
+    if clip.count is not None and len(t_us) != clip.count:
+        raise ValueError(
+            f"{file.name}: expected a time for each of {clip.count} frames, got {len(t_us)}; write one line a frame"
+        )
+    return file.name, itertools.zip_longest(clip.frames(), t_us.tolist())
+
+
+def _from_zero(clip: Clip, source: str, frames: Timed, saturation: list[float]) -> Iterator[StokesFrame]:
     """Frames of a clip from time 0; `saturation` gets the share of saturated pixels of each.
 
     ValueError for more or fewer times than frames, and for times of a video that do not increase.
     """
-    number, before, first = -1, -1, 0.0
-    for number, frame in enumerate(clip.frames()):
-        if number == times.number:
-            raise ValueError(f"{times.source}: expected a time for each frame, got {number} times and more frames")
-        time_us = times.of(number, frame)
+    before, first = -1, 0.0
+    for number, (frame, time_us) in enumerate(frames):
+        if frame is None or time_us is None:
+            left = "frames and more times" if frame is None else "times and more frames"
+            raise ValueError(f"{source}: expected a time for each frame, got {number} {left}")
         first = time_us if number == 0 else first
         t_us = round(time_us - first)
         if t_us <= before:
             raise ValueError(
-                f"{times.source}: expected times that increase, got {before} and {t_us} us for frames {number - 1} and "
+                f"{source}: expected times that increase, got {before} and {t_us} us for frames {number - 1} and "
                 f"{number}; give --fps HZ or --times FILE"
             )
         before = t_us
         saturation.append(frame.saturated)
         yield StokesFrame(t_us, _polarized(clip, frame).stokes)
-    if times.number is not None and number + 1 < times.number:
-        raise ValueError(f"{times.source}: expected a time for each of {number + 1} frames, got {times.number}")

@@ -1,4 +1,4 @@
-"""Commands that look at stores and recordings: inspect, view, video, replay, verify."""
+"""Commands that look at stores and recordings: inspect, view, replay, verify."""
 
 import argparse
 import functools
@@ -16,16 +16,14 @@ from polarnet.recordings.live import replay as replay_events
 from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
-from polarnet.reports.preview import write_true_video
-from polarnet.reports.recordings import draw_hot_pixels, recording_picture
-from polarnet.reports.viewing import films_of, recording_film
+from polarnet.reports.recordings import recording_picture
+from polarnet.reports.viewing import films_of
 from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, SplitStore
 from polarnet.storage.groups import is_url, open_group
-from polarnet.storage.parts import Store, unknown_sequence
+from polarnet.storage.parts import Store
 from polarnet.storage.scenes import SceneStore
-from polarnet.storage.true_frames import open_truth, truth_beside
 from polarnet.training.engine.recorder import read_running
 
 STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
@@ -40,17 +38,15 @@ def inspect(options: argparse.Namespace) -> None:
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
-    inspection = inspect_recording(open_recording(file, part=options.part, **reading_of(options)), HOT_FACTOR)
+    inspection = inspect_recording(open_recording(file, **reading_of(options)), HOT_FACTOR)
     print(*findings(inspection), sep="\n")
     folder = options.out or Path("outputs", "inspect")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{file.name}.png").write_bytes(recording_picture(inspection))
     print(f"picture     {folder / file.name}.png")
     if inspection.hot.any():
-        draw_hot_pixels(inspection.counts, inspection.hot, folder / f"{file.name}.hot.png")
         write_hot_pixels(folder / f"{file.name}.hot.txt", inspection.hot)
-        print(f"hot pixels  {folder / file.name}.hot.png")
-        print(f"list        {folder / file.name}.hot.txt, for --hot-pixels")
+        print(f"hot pixels  {folder / file.name}.hot.txt, for --hot-pixels")
 
 
 def view(options: argparse.Namespace) -> None:
@@ -66,34 +62,15 @@ def view(options: argparse.Namespace) -> None:
 
 
 def _written_page(options: argparse.Namespace) -> Path:
-    open_file = functools.partial(open_recording, part=options.part, **reading_of(options))
     if is_recording(options.path):
         refuse(options, "a recording", ["sequence"])
-        films = [recording_film(options.path, open_file)]
     else:
         refuse(options, "a store or a folder", ["part", *READING])
-        films = films_of(options.path, options.sequence or ())
+    open_file = functools.partial(open_recording, **reading_of(options))
+    films = films_of(options.path, options.sequence or (), open_file)
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)
     return write_player(page, f"{options.path}", films, {"command": options.command_line})
-
-
-def video(options: argparse.Namespace) -> None:
-    """Draw a stored sequence and its truth."""
-    store = EventStore.open(options.store)
-    name = store.sequences[0] if options.sequence is None and len(store.sequences) == 1 else options.sequence
-    if name not in store.sequences:
-        raise ValueError(f"{options.store}: {unknown_sequence(name, store.sequences)}")
-    truth = options.truth or truth_beside(options.store)
-    if truth is None:
-        raise ValueError(
-            f"{options.store}: expected frames.zarr or truth.zarr beside it, there is none; name the true frames with "
-            f"--truth, or draw predictions with `polarnet recover {options.store}`"
-        )
-    out = options.out or Path("outputs", "video", f"{name}.mp4")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_true_video(out, store.read(name), open_truth(truth, name))
-    print(f"video {out}")
 
 
 def replay(options: argparse.Namespace) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node
 from ruamel.yaml.representer import RoundTripRepresenter
@@ -72,6 +71,7 @@ def write_preset(root: Path, name: str) -> list[str]:
     yaml = YAML()
     yaml.preserve_quotes = True
     yaml.width = 120
+    yaml.default_flow_style = None  # lists as [1, 2], as everywhere in params.yaml
     yaml.Representer = WithNulls
     path, group = root / "params.yaml", group_of(root, name)
     params, base = yaml.load(path), _original_values(root)
@@ -86,7 +86,7 @@ def write_preset(root: Path, name: str) -> list[str]:
             raise ValueError(f"{group} {name!r} sets {key}, which params.yaml does not have")
         if node[last] != value:
             changed.append(f"{key}: {node[last]} -> {value}")
-            node[last] = _in_style(value)
+            node[last] = value
     with replaced(path) as temporary:
         yaml.dump(params, temporary)
     return changed
@@ -111,17 +111,6 @@ def _original_values(root: Path) -> dict[str, Any]:
 def _as_override(value: Any) -> str:
     """A value as Hydra reads it: JSON without quotes."""
     return json.dumps(value, ensure_ascii=False).replace('"', "")
-
-
-def _in_style(value: Any) -> Any:
-    """Lists in flow style, such as [1, 2], as everywhere in params.yaml; also those in a mapping."""
-    if isinstance(value, dict):
-        return CommentedMap({key: _in_style(one) for key, one in value.items()})
-    if not isinstance(value, list):
-        return value
-    line = CommentedSeq(value)
-    line.fa.set_flow_style()
-    return line
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

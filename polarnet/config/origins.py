@@ -111,7 +111,7 @@ class Run:
             values: dict[str, Any] = {}
             made = self.made_inputs(stage)
             for artefact in made:
-                if origin := self.origin_of(artefact):
+                if origin := read_origin(self.config.place(artefact)):
                     values |= origin.values
             for key in (key for key in stage.params if key not in UNCOMPARED):
                 values[key] = functools.reduce(operator.getitem, key.split("."), self.values)
@@ -136,10 +136,11 @@ class Run:
 
         ValueError for a damaged origin.
         """
-        origin, place, maker = self.origin_of(artefact), self.config.place(artefact), self.maker_of(artefact)
-        command = shlex.join(maker.command)
-        if origin is None:
+        place, maker = self.config.place(artefact), self.maker_of(artefact)
+        origin = read_origin(place)
+        if origin is None or maker is None:
             return None
+        command = shlex.join(maker.command)
         if change := self.change_since(origin):
             key, was, now = change
             return (
@@ -155,10 +156,6 @@ class Run:
             if self.config.place(source).is_dir() and self._content_of(source) != was:
                 return f"{place} was made from another {self.config.place(source)} than the one there now; {again}"
         return None
-
-    def origin_of(self, artefact: str) -> "Origin | None":
-        """How an artefact was made; None if it keeps no origin, as files of a user do; ValueError for a damaged one."""
-        return read_origin(self.config.place(artefact))
 
     def change_since(self, origin: "Origin") -> tuple[str, Any, Any] | None:
         """Key, old and new value of the first value that differs from an origin; None if all are equal."""
@@ -177,18 +174,15 @@ class Run:
             self._contents[artefact] = digest([self.config.place(artefact)])
         return self._contents[artefact]
 
-    def is_made(self, artefact: str) -> bool:
-        """Whether a stage makes an artefact."""
-        return any(PurePath(artefact).is_relative_to(out) for stage in self.pipeline.values() for out in stage.outs)
-
     def is_stale(self, stage: Stage) -> bool:
         """Whether an output of a stage is missing, has no origin, or cannot be used with this configuration."""
-        return any(self.origin_of(out) is None or self.problem_of(out) is not None for out in stage.outs)
+        return any(read_origin(self.config.place(out)) is None or self.problem_of(out) for out in stage.outs)
 
-    def maker_of(self, artefact: str) -> Stage:
-        """The stage that makes an artefact of the pipeline."""
+    def maker_of(self, artefact: str) -> Stage | None:
+        """The stage that makes an artefact; None if none does."""
         path = PurePath(artefact)
-        return next(s for s in self.pipeline.values() if any(path.is_relative_to(out) for out in s.outs))
+        makers = (one for one in self.pipeline.values() if any(path.is_relative_to(out) for out in one.outs))
+        return next(makers, None)
 
 
 class Origin(NamedTuple):

@@ -119,10 +119,8 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
 
 
 def lpips_of(config: Config) -> Lpips | None:
-    """LPIPS of the table, by the weights that stage `weights` wrote; None without LPIPS, ValueError without weights."""
-    if not config.benchmark.lpips:
-        return None
-    return Lpips.load(config.paths.weights, "benchmark", config.benchmark.lpips_backbone)
+    """LPIPS of the table; None without LPIPS, ValueError without its weights."""
+    return Lpips.load(config.benchmark.lpips_backbone) if config.benchmark.lpips else None
 
 
 def train_mean_of(config: Config) -> float:

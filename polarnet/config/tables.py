@@ -9,7 +9,7 @@ from typing import Any
 from polarnet.benchmark.results import read_record, read_rows, write_benchmark
 from polarnet.config.pipeline import row_folder, rows_of_set, set_folder, set_names, train_mean_of
 from polarnet.config.tree import DOLP_TRAINING, Config
-from polarnet.metrics.lpips import NO_RECORD, stored_record
+from polarnet.metrics.lpips import record_of
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.recorder import HISTORY
 
@@ -26,7 +26,7 @@ def collect_rows(config: Config) -> dict[str, dict[str, dict[str, Any]]]:
         reasons = "; ".join(f"{row}: {reason}" for row, reason in left_out.items())
         raise ValueError(f"benchmark.methods: expected at least one row that can run, got none ({reasons})")
     about = {
-        "lpips": stored_record(config.paths.weights, "benchmark") if config.benchmark.lpips else NO_RECORD,
+        "lpips": record_of(config.benchmark.lpips_backbone if config.benchmark.lpips else None),
         "train_mean": train_mean_of(config),
         "left_out": left_out,
         "weights": {section: file for record in records.values() for section, file in record.weights.items()},

@@ -21,7 +21,7 @@ from polarnet.config.origins import Run
 from polarnet.methods import METHODS
 from polarnet.methods.method import GainConfig, SharpeningConfig
 from polarnet.methods.registration import RegistrationConfig
-from polarnet.metrics.lpips import BACKBONES, PURPOSES, LpipsConfig, Purpose, installed_version, is_stored
+from polarnet.metrics.lpips import BACKBONES, LpipsConfig, installed_version
 from polarnet.networks.registry import NETWORKS, NetworkConfig
 from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
@@ -112,7 +112,6 @@ class Paths:
     scenes: str
     frames: str
     events: str
-    weights: str
     train: str
     sets: str
     rotating: str
@@ -297,7 +296,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
     @functools.wraps(main)
     def checked(node: DictConfig) -> None:
         config = or_exit(lambda: typed(node))
-        or_exit(lambda: _check_lpips(config))
+        or_exit(lambda: check_lpips(config))
         run = Run(root, config, script)
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
@@ -355,34 +354,19 @@ def _file_of(main: Callable[..., None]) -> Path:
     return Path(sys.modules[main.__module__].__file__ or "").resolve()
 
 
-def with_lpips(config: Config, purpose: Purpose, use: Callable[[str], T]) -> T | None:
-    """Call `use` with the LPIPS backbone for a purpose; None if the purpose needs no LPIPS.
-
-    A ValueError from `use` gets the keys that request LPIPS and the overrides that turn it off.
-    """
-    if purpose == "loss":
-        backbone, off = config.lpips.backbone, "0"
-        asking = [key for key, weight in config.lpips_losses.items() if weight > 0]
-    else:
-        backbone, off = config.benchmark.lpips_backbone, "false"
-        asking = ["benchmark.lpips"] if config.benchmark.lpips else []
-    if not asking:
-        return None
-    try:
-        return use(backbone)
-    except ValueError as error:
-        without = " ".join(f"{key}={off}" for key in asking)
-        raise ValueError(f"{', '.join(asking)}: {error}; to go without: {without}") from None
-
-
-def _check_lpips(config: Config) -> None:
-    """Raise ValueError unless stage `weights` has stored the required weights or can find them."""
-
-    def look(purpose: Purpose, backbone: str) -> bool:
-        return is_stored(config.paths.weights, purpose, backbone) or bool(installed_version(backbone))
-
-    for purpose in PURPOSES:
-        with_lpips(config, purpose, functools.partial(look, purpose))
+def check_lpips(config: Config) -> None:
+    """ValueError, with the keys that request LPIPS and the overrides that turn it off, if its weights are missing."""
+    asking = {key: (config.lpips.backbone, "0") for key, weight in config.lpips_losses.items() if weight > 0}
+    if config.benchmark.lpips:
+        asking["benchmark.lpips"] = (config.benchmark.lpips_backbone, "false")
+    for backbone in BACKBONES:
+        keys = {key: off for key, (wanted, off) in asking.items() if wanted == backbone}
+        try:
+            installed_version(backbone)
+        except ValueError as error:
+            if keys:
+                without = " ".join(f"{key}={off}" for key, off in keys.items())
+                raise ValueError(f"{', '.join(keys)}: {error}; to go without: {without}") from None
 
 
 def or_exit(check: Callable[[], T]) -> T:

@@ -1,7 +1,6 @@
 """Windows of events: those between the frames of a sequence, and those cut from a stream as it arrives."""
 
 import itertools
-import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -20,8 +19,6 @@ MAX_PAUSE_US = 3_600_000_000
 """Longest accepted time without an event; a longer one comes from a damaged time stamp and gives endless windows."""
 TRAINED_WINDOW_US = 33_333
 """Window length in the training of the networks, 1/30 s."""
-BIN_EDGES = (0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 13.0, 20.0, math.inf)
-"""Bin edges in events per pixel since the start; finer below 2, where the paper sees the change."""
 
 
 class EventWindow(NamedTuple):
@@ -169,12 +166,6 @@ class WindowCutter:
 
     def _forget(self, places: Sequence[int]) -> None:
         self._held = [slice_count(held, place, len(held)) for held, place in zip(self._held, places, strict=True)]
-
-
-def events_per_pixel(events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Mean number of events per pixel before each time (t < time), averaged over the channels."""
-    counts = torch.stack([torch.searchsorted(e.t, t_us) for e in events]).double().mean(dim=0)
-    return (counts / (events[0].height * events[0].width)).float()
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:

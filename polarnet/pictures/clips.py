@@ -41,8 +41,6 @@ class ClipOptions:
     """How to read a clip."""
 
     mosaic: Mosaic | None = None  # angles over 2x2 pixels if the frames are raw mosaics
-    angles: Sequence[int] | None = None
-    """Angles of four videos, in their order; None: from their names, NAME_0, NAME_45, ..."""
     white: float | None = None
     """Level at which the values of a polarization camera saturate; None: from the first frame."""
     grey: bool = False  # take colour frames as grey, without polarization
@@ -78,7 +76,7 @@ def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
     if len(paths) == 4 and all(extension(path) not in VIDEOS for path in paths):
         return _open_files([tuple(paths)], ANGLE_SUFFIX.sub(r"\g<name>", name), options)
     if len(paths) == 4:
-        videos = _videos_by_angle(paths, options.angles)
+        videos = _videos_by_angle(paths)
         return _measured(videos[0].stem.rpartition("_")[0] or name, "four polarizers", _from_videos(videos), options)
     if len(paths) != 1:
         raise UnreadablePicture(f"expected one file or folder, or four videos behind polarizers, got {len(paths)}")
@@ -198,15 +196,13 @@ def _checked(path: Path, pixels: np.ndarray) -> Shaped[np.ndarray, "h w 3"]:
     return pixels
 
 
-def _videos_by_angle(paths: Sequence[Path], angles: Sequence[int] | None) -> list[Path]:
-    """Four videos in the order 0, 45, 90, 135."""
-    if angles is None:
-        matches = [ANGLE_SUFFIX.fullmatch(path.stem) for path in paths]
-        angles = [int(match["angle"]) for match in matches if match]
+def _videos_by_angle(paths: Sequence[Path]) -> list[Path]:
+    """Four videos in the order of the angles in their names, 0, 45, 90, 135."""
+    angles = [int(match["angle"]) for path in paths if (match := ANGLE_SUFFIX.fullmatch(path.stem))]
     if sorted(angles) != list(POLARIZER_ANGLES_DEG):
         raise UnreadablePicture(
-            f"four videos: expected one behind each of 0, 45, 90, 135 degrees, got {list(angles)}; name them NAME_0, "
-            f"NAME_45, NAME_90, NAME_135, or give --angles in their order"
+            f"four videos: expected one behind each of 0, 45, 90, 135 degrees, got {angles}; name them NAME_0, "
+            f"NAME_45, NAME_90, NAME_135"
         )
     return [path for _, path in sorted(zip(angles, paths, strict=True))]
 

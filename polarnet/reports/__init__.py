@@ -6,8 +6,6 @@ from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.reports.preview import VideoWriter as VideoWriter
-    from polarnet.reports.preview import plot_events as plot_events
-    from polarnet.reports.preview import plot_frame as plot_frame
     from polarnet.reports.preview import plot_prediction as plot_prediction
     from polarnet.reports.preview import write_true_video as write_true_video
 

@@ -1,4 +1,4 @@
-"""Charts of the pages in the pages' own colours (`polarnet.reports.figures.svg`), and figures of studies and sweeps."""
+"""Charts of the pages in the pages' own colours (`polarnet.reports.figures.svg`), and the figure of a sweep."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -12,12 +12,11 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 from polarnet.methods.intensities import GAIN
 from polarnet.reports.figures import LIGHT, PAGE, styled
-from polarnet.reports.legend import GENERAL, OTHER_COLOUR, Legend, in_order
+from polarnet.reports.legend import OTHER_COLOUR, Legend, in_order
 from polarnet.reports.tables import COLUMNS
 
 WIDTH, HEIGHT = 4.8, 2.8  # inches
 ROW_HEIGHT, LABEL_LETTERS = 0.26, 28  # of a label beside a chart: inches, and letters in a line of its label
-PAPER_EVENTS_PER_PIXEL = 1.04  # events per pixel at which the paper's recovery is good (section 5)
 
 
 def _axes(height: float = HEIGHT) -> tuple[Figure, Axes]:
@@ -89,32 +88,4 @@ def reliability_chart(curves: Mapping[str, Sequence[Sequence[float | int]]], leg
         axes.scatter(expected, measured, 4 + 40 * pixels / pixels.max(), color=legend.colour(method))
     axes.set(xlabel="expected squared error", ylabel="measured squared error")
     figure.legend(loc="outside upper left", ncols=2)
-    return figure
-
-
-@styled(LIGHT)
-def event_budget_figure(results: Mapping[str, Any]) -> Figure:
-    """PSNR (dB) and correlation of DoLP against events per pixel since the start, and against window length.
-
-    `results` is the content of event_budget.json.
-    """
-    figure = Figure(figsize=(7.0, 5.0), layout="constrained", facecolor="none")
-    axes = figure.subplots(2, 2, sharey="row")
-    for column, (study, x, scale, label, title) in zip(axes.T, (
-        ("since_start", "events_per_pixel", 1.0, "events per pixel", "since the start (dashed: the paper's 1.04)"),
-        ("window_length", "window_us", 1e-3, "window, ms", "by window length"),
-    ), strict=True):  # fmt: skip
-        for axis, metric in zip(column, ("psnr", "corr"), strict=True):
-            for method in in_order(results[study]):
-                places, values = zip(*((scale * one[x], one[metric]) for one in results[study][method]), strict=True)
-                style = "o--" if method.endswith(GAIN) else "o-"
-                axis.plot(places, values, style, color=GENERAL.colour(method), label=GENERAL.label(method))
-            axis.set_xscale("log")
-            _plain_numbers(axis.xaxis)
-        column[0].set_title(title, loc="left", fontsize=9)
-        column[1].set_xlabel(label)
-    for axis, label in zip(axes[:, 0], ("PSNR, dB", "correlation"), strict=True):
-        axis.axvline(PAPER_EVENTS_PER_PIXEL, color=LIGHT.quiet, linewidth=0.9, linestyle="--")
-        axis.set_ylabel(label)
-    axes[0][0].legend()
     return figure

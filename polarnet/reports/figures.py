@@ -3,12 +3,12 @@
 Figures are returned, not shown; `polarnet.reports.maps.png` and `svg` encode them.
 """
 
-import functools
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import ContextDecorator
 from dataclasses import dataclass
-from typing import Any, ParamSpec
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -17,10 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from polarnet.reports.maps import DOLP_COLOURS
-
-Arguments = ParamSpec("Arguments")
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,9 @@ VARIABLES = {PAGE.text: "var(--text)", PAGE.quiet: "var(--quiet)", PAGE.grid: "v
 UNUSED_IDS = re.compile(r' id="[A-Za-z0-9]+(?:\.[a-z]+)?_\d+"')  # nothing refers to the names of groups
 
 
-def chart_style(theme: Theme) -> dict[Any, Any]:
-    """matplotlib settings shared by all figures."""
-    return {
+def styled(theme: Theme) -> ContextDecorator:
+    """The style of all figures in the colours of `theme`: a decorator of a function that draws."""
+    settings: dict[Any, Any] = {
         "font.family": "DejaVu Sans",  # comes with matplotlib, so that text looks the same everywhere
         "font.size": 8,
         "text.color": theme.text,
@@ -67,20 +66,7 @@ def chart_style(theme: Theme) -> dict[Any, Any]:
         "legend.frameon": False,
         "legend.fontsize": 7,
     }
-
-
-def styled(theme: Theme) -> Callable[[Callable[Arguments, Figure]], Callable[Arguments, Figure]]:
-    """Decorate a function that draws a figure: it draws in the style of `theme`."""
-
-    def decorate(draw: Callable[Arguments, Figure]) -> Callable[Arguments, Figure]:
-        @functools.wraps(draw)
-        def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Figure:
-            with matplotlib.rc_context(chart_style(theme)):
-                return draw(*args, **kwargs)
-
-        return drawn
-
-    return decorate
+    return matplotlib.rc_context(settings)
 
 
 def svg(figure: Figure) -> Markup:
@@ -95,20 +81,14 @@ def svg(figure: Figure) -> Markup:
     return Markup(drawing)
 
 
-def tile_grid(
-    rows: int, columns: int, shape: Sequence[int], bar_row: int = 0, heading_lines: int = 1
-) -> tuple[Figure, np.ndarray]:
+def tile_grid(rows: int, columns: int, shape: Sequence[int], bar_row: int = 0) -> tuple[Figure, np.ndarray]:
     """A figure and its axes for pictures of `shape`, with a colour bar of DoLP beside row `bar_row`."""
-    tile, gap, left, right, top, below = 1.35, 0.06, 0.22, 0.5, 0.12 + 0.14 * heading_lines, 0.2  # inches
-    tile_height = tile * shape[0] / shape[1]
-    width, height = left + columns * (tile + gap) + right, top + rows * (tile_height + below)
-    figure = Figure(figsize=(width, height), facecolor=LIGHT.face)
+    tile, label = 1.4, 0.15  # inches
+    size = columns * tile + 0.7, rows * (tile * shape[0] / shape[1] + label) + 2 * label
+    layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0, hspace=0)
+    figure = Figure(figsize=size, facecolor=LIGHT.face, layout=layout)
     grid = figure.subplots(rows, columns, squeeze=False)
-    figure.subplots_adjust(
-        left / width, below / height, 1 - (right + gap) / width, 1 - top / height, gap / tile, below / tile_height
-    )
-    place = grid[bar_row, -1].get_position()
-    bar = figure.add_axes((place.x1 + (gap + 0.04) / width, place.y0, 0.09 / width, place.height))
+    bar = grid[bar_row, -1].inset_axes((1.05, 0, 0.07, 1))
     colours = figure.colorbar(ScalarMappable(cmap=DOLP_COLOURS), cax=bar, ticks=[0, 0.5, 1])
     colours.ax.tick_params(labelsize=6, length=2, pad=2, colors=LIGHT.quiet)
     colours.outline.set_visible(False)

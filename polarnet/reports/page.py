@@ -14,12 +14,13 @@ from polarnet.methods import is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
 from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, results_table
 from polarnet.reports.charts import error_chart, reliability_chart
+from polarnet.reports.comparison import comparison_figure
 from polarnet.reports.figures import svg
 from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
-from polarnet.reports.maps import png
-from polarnet.reports.paper import comparison_figure, write_paper_files
+from polarnet.reports.maps import write_figure
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
 from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
+from polarnet.runtime.files import check_name
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import best_row, read_history
 
@@ -42,10 +43,9 @@ SET_ABOUT = {
 
 
 def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
-    """Write index.html and, beside it, comparison.png and the folder paper; `baselines` were trained.
+    """Write index.html and, beside it, a comparison of the methods on each set; `baselines` were trained.
 
-    The folder holds the paper's Table 2 and figures 9 and 10 (`polarnet.reports.paper`). The page needs no other file
-    and no network. FileNotFoundError names missing artefacts and the stage to run.
+    The page needs no other file and no network. FileNotFoundError names missing artefacts and the stage to run.
     """
     manifest, results = read_manifest(paths.images), read_results(paths.simulated)
     generated = {entry.name for entry in manifest.pictures if entry.source == GENERATED}
@@ -53,7 +53,6 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     panels = sorted(results.panels, key=lambda p: (scene_of[p.sequence] in generated, -float(p.truth.dolp.std())))
     others = [read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED]
     sets = [results._replace(panels=panels), *others]
-    write_paper_files(folder / "paper", sets, legend_of(results.details["weights"]))
     content = {
         "title": "polarnet report",
         "scenes": _in_words(results.details["scenes"], "simulated scene", generated),
@@ -67,7 +66,7 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
 
 
 def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str]) -> Path:
-    """Write index.html and comparison.png beside the metrics.json, details.json and panels of one test set.
+    """Write index.html and a comparison of the methods beside metrics.json, details.json and panels of a test set.
 
     `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
     """
@@ -83,15 +82,15 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
 
 
 def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any]) -> Path:
-    """Fill the template into index.html, and write the panels as comparison.png; no such file without panels."""
+    """Fill the template into index.html, and draw the first panels of each set as comparison_SET.png and .pdf."""
     results, *others = sets
     metrics, details = results.metrics, results.details
     legend, means = legend_of(details["weights"]), details["scene_means"].get("mse", {})
     method = OURS if OURS in metrics else _best_method(metrics)
     folder.mkdir(parents=True, exist_ok=True)
-    if results.panels:
-        figure = comparison_figure(results.panels[:MAX_FIGURE_PANELS], results.panels[0].predictions, legend)
-        (folder / "comparison.png").write_bytes(png(figure))
+    for one in (one for one in sets if one.panels):
+        figure = comparison_figure(one.panels[:MAX_FIGURE_PANELS], legend)
+        write_figure(figure, folder / f"comparison_{check_name(one.name)}")
     films = [panel_film(panel, legend) for panel in results.panels]
     films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
     names = [film.name for film in films]

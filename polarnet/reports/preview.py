@@ -1,6 +1,6 @@
 """Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4.
 
-`plot_events`, `plot_frame` and `plot_prediction` return pictures that a notebook shows and that `save` writes.
+`plot_prediction` returns a picture that a notebook shows and that `save` writes.
 """
 
 import functools
@@ -37,6 +37,7 @@ from polarnet.terminal.progress import ProgressBar
 CODEC, PIXELS = "libx264", "yuv420p"  # the one pair that every browser plays
 QUALITY = {"preset": "ultrafast", "crf": "18", "threads": "1"}  # a second thread would take the network's core
 LAYOUT = {"movflags": "hybrid_fragmented", "flush_packets": "1"}  # plays after a kill, an ordinary MP4 once closed
+PICTURES_PER_SECOND = 30.0
 SECONDS_PER_FRAGMENT = 2  # the most that a kill loses
 MIN_PANEL, MAX_PANEL = 240, 640  # pixels of a panel's longer side: small sensors are enlarged, large ones reduced
 GAP, MARGIN = 8, 12
@@ -173,9 +174,9 @@ class Sheet:
 
 
 def write_true_video(
-    path: Path, channels: Sequence[Events], truth: TrueFrames, rate_hz: float = 30.0, gamma: float = 1.0
+    path: Path, channels: Sequence[Events], truth: TrueFrames, gamma: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Write a picture (`Sheet.truth`) of each two true frames as a video, with a progress bar.
+    """Write a picture (`Sheet.truth`) of each two true frames as a video of 30 a second, with a progress bar.
 
     Returns the picture with most events, None if there is none.
 
@@ -192,7 +193,7 @@ def write_true_video(
     dtype('uint8')
     """
     sheet, busiest, most = Sheet(channels[0].height, channels[0].width), None, -1
-    with VideoWriter(path, rate_hz) as video:
+    with VideoWriter(path, PICTURES_PER_SECOND) as video:
         for k in ProgressBar(range(1, len(truth)), "video", unit="picture"):
             span = int(truth.t_us[k - 1]), int(truth.t_us[k])
             window = [slice_time(events, *span) for events in channels]
@@ -207,39 +208,6 @@ def foot_of(span_us: tuple[int, int], count: int) -> str:
     """Line of text below a picture: the time span of its events, their number, and their colours."""
     start, stop = (time / 1000 for time in span_us)
     return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
-
-
-def plot_events(events: Sequence[Events]) -> Image.Image:
-    """ON (red) minus OFF (blue) events of each pixel, behind each of the four polarizers.
-
-    >>> from polarnet.events import Events
-    >>> from polarnet.reports import plot_events
-    >>> plot_events([Events.empty(20, 30)] * 4).mode
-    'RGB'
-    """
-    sheet = Sheet(events[0].height, events[0].width)
-    maps = sheet.events(torch.stack([polarity_sums(channel) for channel in events]))
-    captioned = {f"events, {angle}°": one for angle, one in zip(POLARIZER_ANGLES_DEG, maps, strict=True)}
-    times = torch.cat([channel.t for channel in events])
-    span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
-    return Image.fromarray(sheet.picture([captioned], foot_of(span, len(times))))
-
-
-def plot_frame(s0: Float[Tensor, "h w"], dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> Image.Image:
-    """S0 (in [0, 1]), DoLP, AoLP (radians) and their polarization as hue, saturation and value.
-
-    >>> import torch
-    >>> from polarnet.reports import plot_frame
-    >>> plot_frame(torch.rand(20, 30), torch.rand(20, 30), torch.rand(20, 30)).mode
-    'RGB'
-    """
-    captioned = {
-        "S0": intensity_image(s0),
-        "DoLP": dolp_image(dolp),
-        "AoLP (hue), DoLP (saturation)": angle_image(dolp, aolp),
-        "polarization and S0": polarization_hsv(s0, dolp, aolp),
-    }
-    return Image.fromarray(Sheet(*dolp.shape).picture([captioned], ""))
 
 
 def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = None) -> Image.Image:

@@ -1,11 +1,10 @@
-"""Pictures of recordings and of their calibration: start times, thresholds, hot pixels."""
+"""Pictures of recordings and of their calibration: start times, thresholds."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -78,18 +77,6 @@ def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
     for axes, name in zip(grid[:, 0], [*names, "DoLP"], strict=True):
         axes.set_ylabel(name, fontsize=7)
     write_figure(figure, path)
-
-
-def draw_hot_pixels(counts: np.ndarray, hot: Bool[np.ndarray, "h w"], path: Path) -> None:
-    """Write a picture of each pixel's event count, with the hot pixels circled."""
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots()
-    image = axes.imshow(np.log1p(counts), cmap="gray")
-    rows, columns = np.nonzero(hot)
-    axes.scatter(columns, rows, s=60, facecolors="none", edgecolors=COLOURS[0])
-    axes.set_title(f"{len(rows)} hot pixels")
-    figure.colorbar(image, ax=axes, label="log(1 + events)")
-    path.write_bytes(png(figure))
 
 
 def _draw_landmark(events: Axes, pictures: Axes, target: Calibrated, config: RecordingsConfig) -> None:

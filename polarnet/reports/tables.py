@@ -1,4 +1,4 @@
-"""Benchmark scores as tables: selected, rounded and ranked once, then written as plain text, LaTeX or HTML."""
+"""Benchmark scores as tables: selected, rounded and ranked once, then written as plain text or HTML."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -147,24 +147,6 @@ def score_table(
 def paper_table(experiment: Literal["simulated", "real"]) -> Table:
     """Published figures: one of the two experiments in the paper's Table 2."""
     return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
-
-
-def as_latex(table: Table, groups: Sequence[str] = ()) -> str:
-    """A LaTeX tabular for booktabs: best values in bold, notes as comments.
-
-    `groups` are headings above equal runs of columns, left to right.
-    """
-    width = len(table.headings) // max(1, len(groups))
-    lines = [rf"% {note}" for note in table.notes]
-    lines += [rf"\begin{{tabular}}{{l{'r' * len(table.headings)}}}", r"\toprule"]
-    if groups:
-        lines.append(" & ".join(["", *(rf"\multicolumn{{{width}}}{{c}}{{{group}}}" for group in groups)]) + r" \\")
-    rows = [["Method", *table.headings]]
-    rows += [[row.label, *(rf"\textbf{{{c.text}}}" if c.best else c.text for c in row.cells)] for row in table.rows]
-    head, *body = (" & ".join(row).replace("↓", r"$\downarrow$").replace("↑", r"$\uparrow$") for row in rows)
-    return "\n".join(
-        [*lines, rf"{head} \\", r"\midrule", *(rf"{row} \\" for row in body), r"\bottomrule", r"\end{tabular}"]
-    )
 
 
 def as_plain(table: Table) -> str:

@@ -26,22 +26,14 @@ APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "
 """Quantity of each array of recovered.zarr and truth.zarr."""
 
 
-def recording_film(path: Path, open_file: Open = open_recording) -> Film:
-    """The film of a camera's file, which `open_file` opens."""
-    return _events_film(path.name, open_plain(path, open_file).whole(), None)
-
-
-def films_of(path: Path, sequences: Sequence[str] = ()) -> list[Film]:
+def films_of(path: Path, sequences: Sequence[str] = (), open_file: Open = open_recording) -> list[Film]:
     """Films of a store, of a folder with stores (all of a sequence in one), or of a camera's file.
-
 
     Without `sequences`, the first `MAX_FILMS` of each store are read. ValueError for an unknown sequence;
     FileNotFoundError if there is nothing to show.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: expected a store, a folder with stores or a recording; there is no such path")
     if is_recording(path):
-        return [recording_film(path)]
+        return [_events_film(path.name, open_plain(path, open_file).whole(), None)]
     stores = [path] if _is_store(path) else sorted(filter(_is_store, path.glob("*.zarr")))
     if not stores:
         raise FileNotFoundError(f"{path}: expected a folder that holds stores (*.zarr), found none")

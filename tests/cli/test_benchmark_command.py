@@ -56,7 +56,7 @@ def test_a_folder_of_photographs_is_scored_with_given_weights(
                   "Sequences of 60x90 pixels (height x width), 0.2 s", "not say what it was trained on"):  # fmt: skip
         assert words in page
     assert 'src="http' not in page
-    assert (out / "comparison.png").exists()
+    assert (out / "comparison_holidays.png").exists()
     files = [path for path in (out / "work" / "set").rglob("*") if path.is_file()]
     written_ns = {path: path.stat().st_mtime_ns for path in files}
     given = metrics["ours"]

@@ -14,6 +14,7 @@ import preloaded
 import pytest
 
 from polarnet.cli import main
+from polarnet.config import tree
 from polarnet.config.experiments import (
     GROUPS,
     changed_values,
@@ -22,7 +23,7 @@ from polarnet.config.experiments import (
     preset_values,
     write_preset,
 )
-from polarnet.config.tree import Config, load, with_lpips
+from polarnet.config.tree import Config, check_lpips, load
 
 
 @pytest.fixture
@@ -161,19 +162,19 @@ def test_a_stage_does_not_start_without_the_weights_of_lpips(project_root, tmp_p
 LPIPS_WEIGHTS = ("loss.lpips", "baselines.e2v.lpips", "baselines.e2p.lpips", "baselines.e2p.intensity_lpips")
 
 
-def refuse(backbone: str) -> str:
-    raise ValueError(f"no {backbone}")
+def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root, monkeypatch):
+    def refuse(backbone):
+        raise ValueError(f"no {backbone}")
 
-
-def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root):
-    config = load(project_root, [f"{key}=0.0" for key in LPIPS_WEIGHTS[1:]])
-    with pytest.raises(ValueError, match=r"^loss.lpips: no alex; to go without: loss.lpips=0$"):
-        with_lpips(config, "loss", refuse)
-    given = load(project_root, ["lpips.backbone=vgg", *(f"{key}=0.0" for key in LPIPS_WEIGHTS)])
-    assert with_lpips(given, "loss", refuse) is None
-    with pytest.raises(ValueError, match=r"^benchmark.lpips: no alex; to go without: benchmark.lpips=false$"):
-        with_lpips(given, "benchmark", refuse)
-    assert with_lpips(load(project_root, ["benchmark.lpips=false"]), "benchmark", refuse) is None
+    monkeypatch.setattr(tree, "installed_version", refuse)
+    without = [f"{key}=0.0" for key in LPIPS_WEIGHTS]
+    for overrides, said in (
+        (["benchmark.lpips=false", *without[1:]], "loss.lpips: no alex; to go without: loss.lpips=0"),
+        (["lpips.backbone=vgg", *without], "benchmark.lpips: no alex; to go without: benchmark.lpips=false"),
+    ):
+        with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+            check_lpips(load(project_root, overrides))
+    check_lpips(load(project_root, ["benchmark.lpips=false", *without]))
 
 
 def test_every_preset_composes_holds_only_what_differs_and_no_sensor_is_called_like_an_experiment(project_root):

@@ -40,7 +40,7 @@ def make_all(run, *scripts: str) -> None:
         make(run(script))
 
 
-SIMULATION = ("ingest", "synthesize", "emulate", "weights")
+SIMULATION = ("ingest", "synthesize", "emulate")
 
 
 def test_equal_values_are_accepted_and_a_changed_one_names_key_both_values_and_the_command(run, tmp_path):
@@ -82,7 +82,7 @@ def test_a_row_refuses_a_network_of_other_values_and_files_of_a_user_have_no_ori
     make_all(run, *SIMULATION)
     row = run("row", "row=e2v", f"rows.e2v.needs={tmp_path / 'mine.pth'}")
     row.check_inputs()
-    assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr", "data/weights"]
+    assert row.made_inputs(row.stages[0]) == ["data/events.zarr", "data/frames.zarr"]
 
 
 def test_an_origin_holds_the_values_of_an_artefact_and_its_inputs_and_others_are_stale(run, tmp_path):

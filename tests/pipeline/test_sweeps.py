@@ -32,7 +32,7 @@ def project(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
         if sections[0] not in ("runtime", "rows") and key not in ("benchmark.methods", "baselines.trained"):
             functools.reduce(operator.getitem, sections, params)[last] = yaml.safe_load(value)
     YAML().dump(params, root / "params.yaml")
-    for stage in ("ingest", "synthesize", "emulate", "weights", "calibrate", "sets"):
+    for stage in ("ingest", "synthesize", "emulate", "calibrate", "sets"):
         assert (done := python(root, stage)).returncode == 0, done.stderr
     return root
 

@@ -63,7 +63,6 @@ def test_inspect_prints_findings_and_draws_no_hot_pixels(tmp_path, make_events, 
     hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
     write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
     assert main(["inspect", "capture.csv"]) == 0
-    assert (tmp_path / "outputs" / "inspect" / "capture.csv.hot.png").stat().st_size > 5000
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
     picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.csv.png"))

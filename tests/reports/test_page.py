@@ -93,7 +93,9 @@ def test_the_player_has_the_scenes_and_the_worst_ones_lead_to_it(page, folder):
     assert len(player["scenes"]) == 2
     assert player["scenes"][0]["name"].startswith("tree")  # photographs come before generated pictures
     assert sorted(re.findall(r'data-scene="([^"]*)"', page)) == ["leaf-00", "tree-00"]
-    assert sorted(path.name for path in folder.iterdir()) == ["comparison.png", "index.html", "paper"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "comparison_simulated.pdf", "comparison_simulated.png", "index.html",
+    ]  # fmt: skip
 
 
 def test_a_benchmark_without_panels_and_without_ours_still_gives_a_page(paths, tmp_path):
@@ -139,7 +141,7 @@ def test_the_page_of_a_set_shows_the_table_the_papers_and_what_was_left_out(path
     shutil.copytree(paths.simulated, folder)
     notes = ["e2vid was left out: run `dvc repro`."]
     set_page = write_set_page(folder, "my <holidays>", "polarnet benchmark --scenes x", notes).read_text()
-    assert (folder / "comparison.png").exists()
+    assert (folder / "comparison_results.png").exists()
     for text in (
         "my &lt;holidays&gt;", "15.56", "oracle mean", "<dt>E2V: FireNet</dt>",
         "<dt>ours: the paper&#39;s network</dt><dd>best.safetensors (sha256 5ca1ab1e5ca1ab1e)</dd>",

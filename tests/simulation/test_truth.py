@@ -15,7 +15,6 @@ import torch
 from part_fixtures import files_of
 from PIL import Image
 
-from polarnet.analysis.event_budget import sequence_at
 from polarnet.config.tree import load
 from polarnet.pictures.ingest import IngestConfig, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
@@ -29,6 +28,7 @@ from polarnet.simulation.scene import LIGHT_RANGE, logarithmic, scene_from_light
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage import EventStore, FrameStore, SceneStore
+from studies.robustness import sequence_at
 
 SEQUENCES_PER_PART = 2
 CONFIG = dataclasses.replace(

@@ -62,7 +62,7 @@ def small_task() -> Task:
 def run(task: Task, stores: tuple[Path, Path], folder: Path, config: LoopConfig = TRAIN, workers: int = 0) -> Path:
     """A whole training; the folder of its outputs."""
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
-    metadata = describe(task, split, config, folder, SEED, CPU)
+    metadata = describe(task, split, config, "alex", SEED, CPU)
     recorder = Recorder(folder / "out", folder / "resume", metadata)
     train(task, split, config, recorder, SEED, CPU, workers)
     return folder / "out"
@@ -135,7 +135,7 @@ def test_a_changed_setting_starts_anew(stores, tmp_path):
     task = small_task()
     split = open_split(EventStore.open(stores[0]), str(stores[1]), task.encode)
     places = {
-        Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, tmp_path, SEED, CPU)).running
+        Recorder(tmp_path / "out", tmp_path / "resume", describe(task, split, config, "alex", SEED, CPU)).running
         for config in (TRAIN, dataclasses.replace(TRAIN, learning_rate=2e-3), dataclasses.replace(TRAIN, epochs=3))
     }
     assert len(places) == 3

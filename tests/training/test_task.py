@@ -50,7 +50,7 @@ def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_mach
     save_checkpoint(Path(start), dolp().network.state_dict(), {"network": "paper"})
     config, loss = dataclasses.replace(TRAIN, start=start), dataclasses.replace(LOSS, half_weight=0.05)
     task = dolp_task("paper", NETWORK, config, loss, None, SEED)
-    described = describe(task, split_of(simulated, task), config, tmp_path, SEED, torch.device("cpu"))
+    described = describe(task, split_of(simulated, task), config, "alex", SEED, torch.device("cpu"))
     assert described["half_weight"] == 0.05
     assert described["data"]["events_from"]["emulate"] == dataclasses.asdict(simulated.camera.sensor)
     assert described["data"]["events_sha256"] == sha256(simulated.events / "zarr.json")

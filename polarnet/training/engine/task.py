@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import fsspec
@@ -12,8 +11,7 @@ from torch import Tensor, nn
 
 from polarnet import __version__
 from polarnet.events.representations import Encode
-from polarnet.metrics.lpips import NO_RECORD, stored_record
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips, record_of
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.storage.events import EventStore
@@ -95,15 +93,16 @@ def initialised(build: Callable[[], Network], seed: int) -> Network:
         return build()
 
 
-def describe(task: Task, split: Split, config: Any, weights: Path, seed: int, device: torch.device) -> dict[str, Any]:
+def describe(task: Task, split: Split, config: Any, backbone: str, seed: int, device: torch.device) -> dict[str, Any]:
     """Collect everything that determines the weights, for a checkpoint's JSON and the running checkpoint's key.
 
-    `training.precision` and `training.optimizer` are those in use on `device` and for the network.
+    `backbone` is that of LPIPS, if the loss has it. `training.precision` and `training.optimizer` are those in use on
+    `device` and for the network.
     """
     events, frames = split.train.events, split.train.frames
     settings = {name: value for name, value in asdict(config).items() if name != "start"}  # start_sha256 stands for it
     precision = precision_on(device, config.precision)
-    lpips = stored_record(weights, "loss") if any("lpips" in term for term in task.loss.weights) else NO_RECORD
+    lpips = record_of(backbone if any("lpips" in term for term in task.loss.weights) else None)
     return {
         **task.description,
         "training": {"seed": seed, **settings, "optimizer": task.optimizer, "precision": precision},
