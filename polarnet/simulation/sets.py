@@ -16,14 +16,14 @@ from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
 from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import are_measurements, group_by_measurement
-from polarnet.runtime.files import changed_files, code_digest, seal, sha256
+from polarnet.runtime.files import SUMS, changed_files, code_digest, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import Synthesis, synthesize
 
-MADE = "made.json"
+MADE = "made.json"  # everything that determines a set; the set is complete once it is sealed
 
 logger = logging.getLogger(__name__)
 
@@ -99,22 +99,18 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
     """
     sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
     settings = sections | {"seed": recipe.seed, "source": source, "code": code_digest()}
-    key = sha256(json.dumps(settings, sort_keys=True).encode())
-    note = folder / MADE
+    note, made = folder / MADE, json.dumps(settings, sort_keys=True)
     if note.exists():
-        try:
-            progress = dict(json.loads(note.read_bytes()))
-        except (TypeError, ValueError):  # damaged
-            progress = {}
-        changed = changed_files(folder) if progress.get("complete") else []
+        complete, same = (folder / SUMS).exists(), note.read_bytes() == made.encode()
+        changed = changed_files(folder) if complete else []
         for problem in changed:
             logger.warning("%s; making the set again", problem.partition(";")[0])
-        if progress == {"key": key, "complete": True} and not changed:
+        if complete and same and not changed:
             return False
-        if progress.get("key") != key or changed:
+        if changed or not same:
             shutil.rmtree(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps({"key": key, "complete": False}))
+    note.write_text(made)
     images, scenes, frames, events = (folder / name for name in ("images", "scenes.zarr", "frames.zarr", "events.zarr"))
     if not (images / "manifest.json").exists():
         fill(images)
@@ -124,7 +120,6 @@ def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path
         synthesize(synthesis, scenes, frames, mapper("synthesize"))
     if not events.exists():
         emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
-    note.write_text(json.dumps({"key": key, "complete": True}))
     seal(folder)
     return True
 

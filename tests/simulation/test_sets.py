@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 
@@ -7,7 +5,7 @@ from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
-from polarnet.runtime.files import seal
+from polarnet.runtime.files import SUMS, seal
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.sets import MADE, Recipe, SetsConfig, kind_of, make_complex_motion, make_folder_set
@@ -76,8 +74,7 @@ def test_a_set_is_made_once_and_again_only_when_its_recipe_changes(images, tmp_p
 def test_a_set_that_was_interrupted_goes_on(images, tmp_path, recipe):
     folder = tmp_path / "complex_motion"
     make_complex_motion(images, folder, harder(), recipe, plain)
-    note = json.loads((folder / MADE).read_text())
-    (folder / MADE).write_text(json.dumps(note | {"complete": False}))
+    (folder / SUMS).unlink()
     before = (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns
     assert make_complex_motion(images, folder, harder(), recipe, plain)
     assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
