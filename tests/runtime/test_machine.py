@@ -16,7 +16,7 @@ from polarnet.runtime.machine import (
     seed_for,
 )
 
-RUNTIME = RuntimeConfig(device="cpu", threads=1, workers=1, devices=1, nodes=1, rendezvous="localhost:29500")
+RUNTIME = RuntimeConfig(device="cpu", threads=1, workers=1)
 
 
 def test_a_seed_depends_on_each_of_its_three_parts_and_on_nothing_else():
