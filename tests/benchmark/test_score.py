@@ -122,7 +122,7 @@ def test_the_angle_is_scored_where_there_is_one(sequence):
     ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
     ({"methods": []}, "methods: expected at least one and none twice"),
     ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
+    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, measured, got"),
 ])  # fmt: skip
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
