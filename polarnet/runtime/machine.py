@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import platform
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,17 +52,14 @@ def generator_for(seed: int, name: str, purpose: str) -> np.random.Generator:
 
 def usable_cores() -> int:
     """Number of cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def memory() -> tuple[int, int]:
-    """Free and total memory of this machine in bytes; only Linux states how much is free, others count as empty."""
-    if sys.platform == "linux":
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
-        return free, total
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return total, total
+    """Free and total memory of this machine in bytes."""
+    lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
+    return free, total
 
 
 def limit_threads(threads: int) -> None:
@@ -121,12 +117,10 @@ def precision_on(device: torch.device, precision: str) -> str:
 
 
 def end_with_parent(parent: int | None = None) -> None:
-    """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems.
+    """Let the system kill this process when the one that started it ends, however that ends.
 
     That one may have ended already: `parent` is its process number; None: multiprocessing knows it.
     """
-    if sys.platform != "linux":
-        return
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     starter = multiprocessing.parent_process()
     lives = os.getppid() == parent if parent is not None else starter is None or starter.is_alive()
