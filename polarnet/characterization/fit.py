@@ -9,7 +9,6 @@ import numpy as np
 from polarnet.characterization.intervals import (
     GROUPS,
     Estimate,
-    between_shot_noise_us,
     by_pixel,
     chosen_pixels,
     intervals_of,
@@ -76,12 +75,10 @@ def fit_sensor(
         if noise.swing > MAX_SWING:
             fit.notes.append(
                 f"the rate of OFF events in the static recording varies by {noise.swing:.0%} beyond chance: its light "
-                f"was not constant, so its noise, hot pixels and refractory period mean nothing; record a still scene"
+                f"was not constant, so its noise and hot pixels mean nothing; record a still scene"
             )
-    durations_us = [intervals_of(one).duration_us for one in ordered]
-    dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
-    reason = "intervals between a pixel's events do not pile up at a minimum, and shot noise is too rare to show it"
-    fit.enter("refractory_period_us", dead_time, reason)
+    dead_time = piled_up_us([intervals_of(one).duration_us for one in ordered])
+    fit.enter("refractory_period_us", dead_time, "intervals between a pixel's events do not pile up at a minimum")
     leak = noise.leak if noise else None
     leak = leak if leak and leak.error <= MAX_LEAK_ERROR * leak.value else None
     reason = "under constant light, shot noise comes before the leak; record brighter"

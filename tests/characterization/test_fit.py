@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polarnet.characterization.fit import fit_sensor
-from polarnet.characterization.intervals import between_shot_noise_us, piled_up_us
+from polarnet.characterization.intervals import piled_up_us
 from polarnet.characterization.light import Flicker, FlickerRecording
 from polarnet.characterization.twin import compare, emulated, fitted_parameters, fitted_sensor, frames_of
 from polarnet.events.stream import slice_count
@@ -96,14 +96,6 @@ def test_the_refractory_period_is_where_intervals_pile_up():
     assert piled_up_us([np.append(free, np.full(200, 500.0))]).value == 500
     assert piled_up_us([free]) is None
     assert piled_up_us([np.repeat([1e3, 2e3, 3e3], [500, 50, 50])]) is None  # at ticks of the clock
-
-
-def test_shot_noise_shows_the_refractory_period_in_which_it_pauses():
-    """A million intervals at 2 Hz: two a microsecond, so the fifth shortest is about 2.5 us above 500 us."""
-    intervals_us = np.random.default_rng(1).exponential(5e5, 1_000_000)
-    assert between_shot_noise_us((500 + intervals_us).round()).value == pytest.approx(500, abs=4)
-    assert between_shot_noise_us(intervals_us.round()) is None
-    assert between_shot_noise_us((500 + intervals_us[:2000]).round()) is None
 
 
 def test_recordings_of_two_sensors_are_refused(static, flickers):
