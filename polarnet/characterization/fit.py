@@ -6,23 +6,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from polarnet.characterization.intervals import (
-    GROUPS,
-    Estimate,
-    by_pixel,
-    chosen_pixels,
-    intervals_of,
-    piled_up_us,
-)
-from polarnet.characterization.light import FlickerRecording, Source, increments_of, source_of
-from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
-from polarnet.characterization.thresholds import (
+from polarnet.characterization.flicker import (
+    FlickerRecording,
     PixelThresholds,
+    Source,
     bandwidth,
     correlation,
     deviation,
+    increments_of,
+    source_of,
     thresholds_without_leak,
 )
+from polarnet.characterization.intervals import GROUPS, Estimate, by_pixel, chosen_pixels, intervals_of, piled_up_us
+from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.terminal.progress import ProgressBar

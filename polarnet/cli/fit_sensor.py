@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
-from polarnet.characterization.light import Flicker, FlickerRecording
+from polarnet.characterization.flicker import Flicker, FlickerRecording
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.recordings.recording import read_recording

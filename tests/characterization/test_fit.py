@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from polarnet.characterization.fit import fit_sensor
+from polarnet.characterization.flicker import Flicker, FlickerRecording
 from polarnet.characterization.intervals import piled_up_us
-from polarnet.characterization.light import Flicker, FlickerRecording
 from polarnet.events.stream import Events
 from polarnet.recordings.noise import event_counts
 from polarnet.simulation.emulator import emulate

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from polarnet.characterization.light import Flicker, flicker_cycle
+from polarnet.characterization.flicker import Flicker, flicker_cycle
 from polarnet.simulation.presets import SENSORS
 
 

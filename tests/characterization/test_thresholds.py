@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 from event_fixtures import events_of
 
+from polarnet.characterization.flicker import (
+    Increments,
+    correlation,
+    deviation,
+    pixel_thresholds,
+    thresholds_without_leak,
+)
 from polarnet.characterization.intervals import by_pixel, intervals_of, undisturbed
-from polarnet.characterization.light import Increments
-from polarnet.characterization.thresholds import correlation, deviation, pixel_thresholds, thresholds_without_leak
 
 
 def constructed(deviation_on: float, noise: float, shots: float, seed: int = 0, pixels: int = 2000, each: int = 40):

@@ -1,0 +1,371 @@
+"""A sinusoidal flicker on all pixels of a camera gives each pixel's contrast thresholds, and the bandwidth.
+
+Light is in digital numbers (DN): 0 is dark, 255 white. The flicker gives the change of filtered log light between two
+events of a pixel, its increment. An increment of duration T that ends with an ON event is (1 - r T) ON thresholds for a
+leak of r hertz; with an OFF event, one OFF threshold plus r T ON thresholds; with shot noise, anything below. A pixel's
+threshold is the robust mean of its increments around their most frequent value. The bandwidth is the one for which
+increments are closest to one threshold.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.optimize import minimize_scalar
+
+from polarnet.characterization.intervals import (
+    GROUPS,
+    MAX_RELATIVE_ERROR,
+    Estimate,
+    Intervals,
+    PixelEvents,
+    chosen_pixels,
+    intervals_of,
+    undisturbed,
+)
+from polarnet.events.stream import Events
+from polarnet.simulation.pixels.light import FULL_SCALE, respond_as_v2e
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, PixelConfig, physics_of
+
+STEPS_PER_CYCLE = 256  # linear pieces of a cycle: 3e-4 of the contrast off at most
+PHASES = 32
+PHASE_INTERVALS = 6000  # intervals that the phase is fitted to
+BLOCK = 8  # consecutive intervals; even blocks make one half of the data, odd blocks the other
+LEAKED = 0.25  # of a threshold: an interval in which the leak alone makes more is not used
+CUTOFF_PIXELS = 600  # pixels that the bandwidth is fitted to
+CUTOFF_GRID = np.geomspace(5, 2500, 14)  # Hz, first guesses
+MIN_INTERVALS = 6  # intervals of one polarity that a pixel needs for a threshold
+FIRST_SCALES = (0.4, 0.25, 0.15, 0.1)  # widths of the robust mean while it approaches the most frequent value
+REFINEMENTS = 12
+MIN_SCALE = 0.003  # relative: 1 us and float32 in a simulation; cameras are far above
+MAX_SCALE = 0.15
+TUKEY = 4.685  # width of the biweight in standard deviations: 95 % efficiency for normal errors
+
+
+@dataclass(frozen=True)
+class Flicker:
+    """The same light on all pixels: level (1 + contrast sin(2 pi frequency t + phase))."""
+
+    level: float
+    """Mean, DN."""
+    contrast: float
+    """(brightest - darkest) / (brightest + darkest)"""
+    frequency_hz: float
+
+    def __post_init__(self):
+        if not 0 < self.contrast < 1:
+            raise ValueError(f"contrast: expected (max - min) / (max + min) between 0 and 1, got {self.contrast}")
+        if not self.frequency_hz > 0:
+            raise ValueError(f"frequency: expected Hz above 0, got {self.frequency_hz}")
+        if not 0 < self.level <= FULL_SCALE / (1 + self.contrast):
+            raise ValueError(
+                f"flicker light: expected a mean above 0 DN whose maximum, mean x (1 + contrast), is at most "
+                f"{FULL_SCALE:g} DN, got {self.level} DN at contrast {self.contrast}; lower the mean"
+            )
+
+    def light(self, phase: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+        """DN at phases in radians."""
+        return self.level * (1 + self.contrast * np.sin(phase))
+
+
+@dataclass(frozen=True)
+class FlickerRecording:
+    """A recording under a flicker whose phase is not known."""
+
+    name: str
+    events: Events
+    flicker: Flicker
+
+
+def flicker_cycle(flicker: Flicker, pixel: PixelConfig, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+    """Response of `pixel` behind a photoreceptor of bandwidth `cutoff_hz` (0: infinite) over one settled cycle.
+
+    It has `STEPS_PER_CYCLE` steps from phase 0 to 2 pi inclusive. As in `pixels.exact`, the response to the light is
+    linear within a step, and the bandwidth is that at the step's mean light.
+    """
+    light = flicker.light(np.linspace(0, 2 * math.pi, STEPS_PER_CYCLE + 1))
+    rounded = np.empty(len(light), np.float32)
+    respond_as_v2e(light.astype(np.float32), physics_of(pixel), rounded)
+    response = rounded.astype(np.float64)
+    if cutoff_hz == 0:
+        return response
+    bandwidth_hz = cutoff_hz * (0.5 * (light[1:] + light[:-1]) + DARK_OFFSET) / SATURATION
+    per_step = 2 * math.pi * bandwidth_hz / (flicker.frequency_hz * STEPS_PER_CYCLE)
+    decay = np.exp(-per_step)
+    steps = np.stack([decay, -np.diff(response) * (1 - decay) / per_step], axis=1).tolist()
+
+    def lags(first: float) -> list[float]:
+        """Filtered response less the response at each step, from the first one on."""
+        return list(itertools.accumulate(steps, lambda lag, step: lag * step[0] + step[1], initial=first))
+
+    return response + lags(lags(0.0)[-1] / (1 - float(decay.prod())))  # a settled cycle ends where it begins
+
+
+def flicker_responses(
+    cycle: Float64[np.ndarray, " k"], frequency_hz: float, phase: float, t_us: Float64[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Filtered response at the times of events, from `flicker_cycle`, for a flicker of `phase` at time 0."""
+    turns = (t_us * (1e-6 * frequency_hz) + phase / (2 * math.pi)) % 1.0
+    return np.interp(turns, np.linspace(0, 1, len(cycle)), cycle)
+
+
+class Source(NamedTuple):
+    """Intervals of a recording under a flicker, and the filtered response at its events for a bandwidth."""
+
+    name: str
+    events: PixelEvents
+    intervals: Intervals
+    responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
+
+
+class Increments(NamedTuple):
+    """Changes of the filtered log light between two events of a pixel, times the polarity of the second event."""
+
+    increment: Float64[np.ndarray, " n"]
+    duration_s: Float64[np.ndarray, " n"]
+    pixel: Int64[np.ndarray, " n"]
+    on: Bool[np.ndarray, " n"]
+    block: Int64[np.ndarray, " n"]
+
+
+def source_of(recording: FlickerRecording, events: PixelEvents, pixel: PixelConfig, refractory_us: float) -> Source:
+    """The intervals of a recording that the refractory period does not disturb; `events` are those of `recording`."""
+    intervals = undisturbed(intervals_of(events), refractory_us)
+    flicker = exact_frequency(recording.flicker, events)
+
+    @functools.cache
+    def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
+        cycle = flicker_cycle(flicker, pixel, cutoff_hz)
+        return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+
+    def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+        cycle, phase = cycle_and_phase(cutoff_hz)
+        return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
+
+    return Source(recording.name, events, intervals, responses)
+
+
+def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
+    """Increments of all sources, for a photoreceptor of bandwidth `cutoff_hz` at full brightness (0: infinite)."""
+    parts = []
+    for source in sources:
+        response, intervals = source.responses(source.events, cutoff_hz), source.intervals
+        increment = np.where(intervals.on, 1.0, -1.0) * (response[intervals.stop] - response[intervals.start])
+        block = np.arange(len(increment)) // BLOCK
+        parts.append((increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block))
+    return Increments(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def at_pixels(source: Source, mask: Bool[np.ndarray, " pixels"]) -> Source:
+    """The part of a source at some pixels."""
+    selected = mask[source.events.pixel]
+    number = np.cumsum(selected) - 1
+    chosen = mask[source.intervals.pixel]
+    start, stop = number[source.intervals.start[chosen]], number[source.intervals.stop[chosen]]
+    rest = (column[chosen] for column in source.intervals[2:])
+    return source._replace(events=chosen_pixels(source.events, mask), intervals=Intervals(start, stop, *rest))
+
+
+def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
+    """The flicker with its frequency on the recording's clock, from the drift of the phase of its events."""
+    t_s, sign = events.t_us * 1e-6, np.where(events.on, 1.0, -1.0)
+    middle = 0.5 * (t_s.min() + t_s.max())
+    frequency = flicker.frequency_hz
+    for parts in (8, 2):
+        edges = np.linspace(t_s.min(), t_s.max(), parts + 1)
+        phase = 2 * math.pi * frequency * (t_s - middle)
+        real, imaginary = (np.histogram(t_s, edges, weights=sign * wave(phase))[0] for wave in (np.cos, np.sin))
+        phasors = real - 1j * imaginary
+        turn = np.angle((phasors[1:] * phasors[:-1].conj()).sum())
+        frequency += turn / (2 * math.pi * (edges[1] - edges[0]))
+    return replace(flicker, frequency_hz=float(frequency))
+
+
+def flicker_phase(
+    cycle: Float64[np.ndarray, " k"], frequency_hz: float, events: PixelEvents, intervals: Intervals
+) -> float:
+    """Phase of the flicker at time 0, radians, which makes the increments of each polarity most nearly equal."""
+    step = max(1, len(intervals.start) // PHASE_INTERVALS)
+    start_us, stop_us = events.t_us[intervals.start[::step]], events.t_us[intervals.stop[::step]]
+    on = intervals.on[::step]
+
+    def unequal(phase: float) -> float:
+        rise = flicker_responses(cycle, frequency_hz, phase, stop_us)
+        rise -= flicker_responses(cycle, frequency_hz, phase, start_us)
+        total = 0.0
+        for values in (rise[on], -rise[~on]):
+            if len(values):
+                middle = float(np.median(values))
+                total += float(np.median(np.abs(values - middle))) / middle if middle > 0 else 10.0
+        return total
+
+    grid = np.arange(PHASES) * (2 * math.pi / PHASES)
+    best = grid[np.argmin([unequal(phase) for phase in grid])]
+    width = 2 * math.pi / PHASES
+    return float(minimize_scalar(unequal, bounds=(best - width, best + width), method="bounded").x)
+
+
+class PixelThresholds(NamedTuple):
+    """Thresholds of one polarity."""
+
+    threshold: Float64[np.ndarray, " pixels"]
+    """Natural-log intensity; NaN for pixels with too few intervals."""
+    halves: Float64[np.ndarray, "2 pixels"]
+    """The same from each half of a pixel's intervals, taken in alternate blocks."""
+    scale: float
+    """Relative standard deviation of increments around their pixel's threshold."""
+
+
+def pixel_thresholds(
+    increment: Float64[np.ndarray, " n"], pixel: Int64[np.ndarray, " n"], block: Int64[np.ndarray, " n"], pixels: int
+) -> PixelThresholds:
+    """Thresholds from `increment`, positive in the direction of the events' polarity.
+
+    `block` numbers stretches of time; even blocks make one half of the data, odd blocks the other. ValueError if no
+    increment is positive.
+    """
+    positive = increment > 0.01
+    increment, pixel, block = increment[positive], pixel[positive], block[positive]
+    if len(increment) == 0:
+        raise ValueError("expected events that follow the light, got none; check the frequency of the flicker")
+    start = np.full(pixels, _most_frequent(increment))
+    near = np.abs(np.log(increment / start[0])) < 0.9
+    start = _medians(increment[near], pixel[near], start)
+    threshold, scale = start, FIRST_SCALES[0]
+    for scale in FIRST_SCALES:
+        threshold = _robust_means(increment, pixel, threshold, scale)
+    for _ in range(REFINEMENTS):
+        scale = _relative_scale(increment, pixel, threshold)
+        threshold = _robust_means(increment, pixel, threshold, scale)
+    enough = np.bincount(pixel[_near(increment, pixel, threshold, scale)], minlength=pixels) >= MIN_INTERVALS
+    halves = []
+    for parity in (0, 1):
+        half = block % 2 == parity
+        estimate = threshold
+        for _ in range(REFINEMENTS // 2):
+            estimate = _robust_means(increment[half], pixel[half], estimate, scale)
+        inliers = _near(increment[half], pixel[half], estimate, scale)
+        filled = np.bincount(pixel[half][inliers], minlength=pixels) >= MIN_INTERVALS // 2
+        halves.append(np.where(filled & enough, estimate, np.nan))
+    return PixelThresholds(np.where(enough, threshold, np.nan), np.stack(halves), scale)
+
+
+def _most_frequent(increment) -> float:
+    """Most frequent increment, from a histogram of logarithms in bins of 0.1, each with its two neighbours."""
+    counts, edges = np.histogram(np.log(increment), np.arange(np.log(0.01), np.log(8.0), 0.1))
+    smooth = np.convolve(counts, np.ones(3), "same")
+    return float(np.exp(edges[np.argmax(smooth)] + 0.05))
+
+
+def _relative_scale(increment, pixel, threshold) -> float:
+    """Standard deviation of relative increments around 1, from the upper side, where shot noise does not reach."""
+    above = increment / threshold[pixel] - 1
+    above = above[(above >= 0) & (above < 0.5)]
+    return float(np.clip(1.4826 * np.median(above), MIN_SCALE, MAX_SCALE)) if len(above) else MAX_SCALE
+
+
+def covariance(a: Float64[np.ndarray, " n"], b: Float64[np.ndarray, " n"]) -> float:
+    """Covariance over the pixels that have both values."""
+    both = np.isfinite(a) & np.isfinite(b)
+    return float(np.cov(a[both], b[both])[0, 1]) if both.sum() > 2 else float("nan")
+
+
+def deviation(thresholds: PixelThresholds) -> float:
+    """Standard deviation between pixels without estimation noise, by the covariance of the two halves."""
+    return max(covariance(*thresholds.halves), 0.0) ** 0.5
+
+
+def correlation(on: PixelThresholds, off: PixelThresholds) -> float:
+    """Correlation of ON and OFF thresholds; each half of one with the other half of the other, so noise drops out."""
+    crossed = 0.5 * (covariance(on.halves[0], off.halves[1]) + covariance(on.halves[1], off.halves[0]))
+    scale = deviation(on) * deviation(off)
+    return float(np.clip(crossed / scale, -1, 1)) if scale > 0 else float("nan")
+
+
+def misfit(increment, pixel, threshold) -> float:
+    """Share of increments far from the threshold of their pixel, 0 to 1; small deviations count little."""
+    squared = np.minimum(((increment / threshold[pixel] - 1) / MAX_SCALE) ** 2, 1.0)
+    return float(np.mean(squared * (3 - 3 * squared + squared**2)))
+
+
+def _near(increment, pixel, threshold, scale) -> Bool[np.ndarray, " n"]:
+    return np.abs(increment / threshold[pixel] - 1) < 3 * scale
+
+
+def _robust_means(increment, pixel, threshold, scale) -> Float64[np.ndarray, " pixels"]:
+    """One step of Tukey's biweight mean of each pixel, of relative width `scale`; unchanged without increments."""
+    u = (increment / threshold[pixel] - 1) / (TUKEY * scale)
+    weight = np.where(np.abs(u) < 1, (1 - u * u) ** 2, 0.0)
+    total = np.bincount(pixel, weight, len(threshold))
+    moved = np.bincount(pixel, weight * increment, len(threshold)) / np.maximum(total, 1e-12)
+    return np.where(total > 0, moved, threshold)
+
+
+def _medians(values, pixel, fallback) -> Float64[np.ndarray, " pixels"]:
+    order = np.lexsort((values, pixel))
+    starts = np.searchsorted(pixel[order], np.arange(len(fallback) + 1))
+    counts = np.diff(starts)
+    middle = np.minimum(starts[:-1] + counts // 2, max(len(values) - 1, 0))
+    return np.where(counts > 0, values[order][middle], fallback)
+
+
+def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> tuple[PixelThresholds, PixelThresholds]:
+    """Thresholds of both polarities, ON and OFF, with the leak taken out of the increments."""
+
+    def pair(leaked: Float64[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]) -> list[PixelThresholds]:
+        increment = data.increment + np.where(data.on, leaked, -leaked)
+        return [
+            pixel_thresholds(increment[chosen], data.pixel[chosen], data.block[chosen], pixels)
+            for chosen in (data.on & usable, ~data.on & usable)
+        ]
+
+    on, off = pair(np.zeros(len(data.on)), np.ones(len(data.on), np.bool_))
+    if leak_hz:
+        threshold = np.where(np.isfinite(on.threshold), on.threshold, np.nanmedian(on.threshold))
+        leaked = leak_hz * data.duration_s
+        on, off = pair(leaked * threshold[data.pixel], leaked < LEAKED)
+    return on, off
+
+
+def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
+    """Bandwidth in Hz; None if the data do not determine it."""
+    pixels = sources[0].events.pixels
+    busy = np.flatnonzero(sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK)
+    if len(busy) < GROUPS:
+        return None
+    chosen = busy[:: max(1, len(busy) // CUTOFF_PIXELS)]
+    logs = []
+    for group in range(GROUPS):
+        mask = np.zeros(pixels, bool)
+        mask[chosen[group::GROUPS]] = True
+        some = [at_pixels(source, mask) for source in sources]
+
+        def loss(log_hz: float, some=some) -> float:
+            data = increments_of(some, math.exp(log_hz))
+            try:
+                pair = thresholds_without_leak(data, leak_hz, pixels)
+            except ValueError:
+                return 2.0
+            total = 0.0
+            for of, thresholds in zip((data.on, ~data.on), pair, strict=True):
+                valid = of & np.isfinite(thresholds.threshold[data.pixel])
+                total += misfit(data.increment[valid], data.pixel[valid], thresholds.threshold) if valid.any() else 1.0
+            return total
+
+        grid = np.log(CUTOFF_GRID)
+        losses = [loss(x) for x in grid]
+        k = int(np.argmin(losses))
+        if k == 0 or k == len(grid) - 1 or losses[k] > 0.98 * losses[-1]:
+            continue
+        bounds = (grid[k - 1], grid[k + 1])
+        logs.append(minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 0.01}).x)
+    if len(logs) < GROUPS // 2 + 1 or np.std(logs, ddof=1) / math.sqrt(len(logs)) > MAX_RELATIVE_ERROR:
+        return None
+    value = math.exp(float(np.median(logs)))
+    names = " and ".join(source.name for source in sources)
+    return Estimate(value, value * float(np.std(logs, ddof=1)) / math.sqrt(len(logs)), f"{names}, whole increments")
