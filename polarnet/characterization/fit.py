@@ -99,7 +99,7 @@ def fit_sensor(
 
 def _fit_flicker(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
     """Enter bandwidth and thresholds; returns the relative deviations of the ON and OFF thresholds."""
-    pixels = sources[0].events.pixels
+    pixels = sources[0].pixels
     names = " and ".join(source.name for source in sources)
     cutoff = bandwidth(sources, leak_hz)
     fit.enter("cutoff_hz", cutoff, "the light changes too slowly; add a flicker near the bandwidth")

@@ -24,7 +24,6 @@ from polarnet.characterization.intervals import (
     Estimate,
     Intervals,
     PixelEvents,
-    chosen_pixels,
     intervals_of,
     undisturbed,
 )
@@ -115,12 +114,13 @@ def flicker_responses(
 
 
 class Source(NamedTuple):
-    """Intervals of a recording under a flicker, and the filtered response at its events for a bandwidth."""
+    """Intervals of a recording under a flicker, and the filtered response at times in us for a bandwidth."""
 
     name: str
-    events: PixelEvents
     intervals: Intervals
-    responses: Callable[[PixelEvents, float], Float64[np.ndarray, " n"]]
+    responses: Callable[[Float64[np.ndarray, " n"], float], Float64[np.ndarray, " n"]]
+    pixels: int
+    """Number of pixels of the sensor."""
 
 
 class Increments(NamedTuple):
@@ -141,34 +141,25 @@ def source_of(recording: FlickerRecording, events: PixelEvents, pixel: PixelConf
     @functools.cache
     def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
         cycle = flicker_cycle(flicker, pixel, cutoff_hz)
-        return cycle, flicker_phase(cycle, flicker.frequency_hz, events, intervals)
+        return cycle, flicker_phase(cycle, flicker.frequency_hz, intervals)
 
-    def responses(some: PixelEvents, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
+    def responses(t_us: Float64[np.ndarray, " n"], cutoff_hz: float) -> Float64[np.ndarray, " n"]:
         cycle, phase = cycle_and_phase(cutoff_hz)
-        return flicker_responses(cycle, flicker.frequency_hz, phase, some.t_us)
+        return flicker_responses(cycle, flicker.frequency_hz, phase, t_us)
 
-    return Source(recording.name, events, intervals, responses)
+    return Source(recording.name, intervals, responses, events.pixels)
 
 
 def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
     """Increments of all sources, for a photoreceptor of bandwidth `cutoff_hz` at full brightness (0: infinite)."""
     parts = []
     for source in sources:
-        response, intervals = source.responses(source.events, cutoff_hz), source.intervals
-        increment = np.where(intervals.on, 1.0, -1.0) * (response[intervals.stop] - response[intervals.start])
+        intervals = source.intervals
+        before, after = (source.responses(t_us, cutoff_hz) for t_us in (intervals.start_us, intervals.stop_us))
+        increment = np.where(intervals.on, 1.0, -1.0) * (after - before)
         block = np.arange(len(increment)) // BLOCK
         parts.append((increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block))
     return Increments(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def at_pixels(source: Source, mask: Bool[np.ndarray, " pixels"]) -> Source:
-    """The part of a source at some pixels."""
-    selected = mask[source.events.pixel]
-    number = np.cumsum(selected) - 1
-    chosen = mask[source.intervals.pixel]
-    start, stop = number[source.intervals.start[chosen]], number[source.intervals.stop[chosen]]
-    rest = (column[chosen] for column in source.intervals[2:])
-    return source._replace(events=chosen_pixels(source.events, mask), intervals=Intervals(start, stop, *rest))
 
 
 def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
@@ -186,19 +177,15 @@ def exact_frequency(flicker: Flicker, events: PixelEvents) -> Flicker:
     return replace(flicker, frequency_hz=float(frequency))
 
 
-def flicker_phase(
-    cycle: Float64[np.ndarray, " k"], frequency_hz: float, events: PixelEvents, intervals: Intervals
-) -> float:
+def flicker_phase(cycle: Float64[np.ndarray, " k"], frequency_hz: float, intervals: Intervals) -> float:
     """Phase of the flicker at time 0, radians, which makes the increments of each polarity most nearly equal."""
-    step = max(1, len(intervals.start) // PHASE_INTERVALS)
-    start_us, stop_us = events.t_us[intervals.start[::step]], events.t_us[intervals.stop[::step]]
-    on = intervals.on[::step]
+    some = intervals.chosen(slice(None, None, max(1, len(intervals.pixel) // PHASE_INTERVALS)))
 
     def unequal(phase: float) -> float:
-        rise = flicker_responses(cycle, frequency_hz, phase, stop_us)
-        rise -= flicker_responses(cycle, frequency_hz, phase, start_us)
+        rise = flicker_responses(cycle, frequency_hz, phase, some.stop_us)
+        rise -= flicker_responses(cycle, frequency_hz, phase, some.start_us)
         total = 0.0
-        for values in (rise[on], -rise[~on]):
+        for values in (rise[some.on], -rise[~some.on]):
             if len(values):
                 middle = float(np.median(values))
                 total += float(np.median(np.abs(values - middle))) / middle if middle > 0 else 10.0
@@ -334,7 +321,7 @@ def thresholds_without_leak(data: Increments, leak_hz: float, pixels: int) -> tu
 
 def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
     """Bandwidth in Hz; None if the data do not determine it."""
-    pixels = sources[0].events.pixels
+    pixels = sources[0].pixels
     busy = np.flatnonzero(sum(np.bincount(source.intervals.pixel, minlength=pixels) for source in sources) >= 2 * BLOCK)
     if len(busy) < GROUPS:
         return None
@@ -343,7 +330,7 @@ def bandwidth(sources: Sequence[Source], leak_hz: float) -> Estimate | None:
     for group in range(GROUPS):
         mask = np.zeros(pixels, bool)
         mask[chosen[group::GROUPS]] = True
-        some = [at_pixels(source, mask) for source in sources]
+        some = [one._replace(intervals=one.intervals.chosen(mask[one.intervals.pixel])) for one in sources]
 
         def loss(log_hz: float, some=some) -> float:
             data = increments_of(some, math.exp(log_hz))

@@ -38,14 +38,22 @@ class PixelEvents(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """Pairs of consecutive events of one pixel. `start` and `stop` index `PixelEvents`."""
+    """Pairs of consecutive events of one pixel, pixel by pixel."""
 
-    start: Int64[np.ndarray, " m"]
-    stop: Int64[np.ndarray, " m"]
     pixel: Int64[np.ndarray, " m"]
     on: Bool[np.ndarray, " m"]
     """Polarity of the event at the end."""
-    duration_us: Float64[np.ndarray, " m"]
+    start_us: Float64[np.ndarray, " m"]
+    stop_us: Float64[np.ndarray, " m"]
+
+    @property
+    def duration_us(self) -> Float64[np.ndarray, " m"]:
+        """Time from the first event to the second."""
+        return self.stop_us - self.start_us
+
+    def chosen(self, which: Bool[np.ndarray, " m"] | slice) -> "Intervals":
+        """Some of the intervals."""
+        return Intervals(*(column[which] for column in self))
 
 
 def by_pixel(events: Events) -> PixelEvents:
@@ -68,9 +76,8 @@ def chosen_pixels(events: PixelEvents, chosen: Bool[np.ndarray, " pixels"]) -> P
 
 def intervals_of(events: PixelEvents) -> Intervals:
     """All pairs of consecutive events of a pixel."""
-    start = np.flatnonzero(events.pixel[1:] == events.pixel[:-1])
-    stop = start + 1
-    return Intervals(start, stop, events.pixel[stop], events.on[stop], events.t_us[stop] - events.t_us[start])
+    same = events.pixel[1:] == events.pixel[:-1]
+    return Intervals(events.pixel[1:][same], events.on[1:][same], events.t_us[:-1][same], events.t_us[1:][same])
 
 
 def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3) -> Intervals:
@@ -81,10 +88,8 @@ def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3)
     """
     free = intervals.duration_us > margin * refractory_us
     after_waiting = np.zeros(len(free), bool)
-    follows = intervals.start[1:] == intervals.stop[:-1]
-    after_waiting[1:] = follows & ~free[:-1]
-    usable = free & ~after_waiting
-    return Intervals(*(column[usable] for column in intervals))
+    after_waiting[1:] = (intervals.pixel[1:] == intervals.pixel[:-1]) & ~free[:-1]
+    return intervals.chosen(free & ~after_waiting)
 
 
 def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate | None:
