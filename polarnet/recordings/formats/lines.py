@@ -279,7 +279,7 @@ def _number(buffer, place, shift):
             count += 1
             if digits < _DIGITS:
                 value = 10 * value + digit
-                digits += value > 0
+                digits += int(value > 0)
                 exponent -= point
             else:
                 exponent += not point
