@@ -1,9 +1,9 @@
-"""data/images and measured polarization -> data/sets: all test sets of benchmark.sets except the simulated one."""
+"""Measured polarization -> data/sets: the test set `measured`, if benchmark.sets names it."""
 
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage, input_folder
-from polarnet.simulation.sets import make_complex_motion, make_folder_set
+from polarnet.simulation.sets import make_folder_set
 
 
 @hydra_stage
@@ -11,10 +11,6 @@ def main(config: Config) -> None:
     """Make every requested set that does not exist yet."""
     folder = Path(config.paths.sets)
     folder.mkdir(parents=True, exist_ok=True)
-    if "complex_motion" in config.benchmark.sets:
-        make_complex_motion(
-            Path(config.paths.images), folder / "complex_motion", config.sets, config.recipe, config.mapper
-        )
     if "measured" in config.benchmark.sets:
         root = input_folder("sets.measured_root", config.sets.measured_root)
         make_folder_set(root, "polarization", folder / "measured", config.recipe, config.mapper)

@@ -29,7 +29,7 @@ from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
 METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
-SETS = ("simulated", "complex_motion", "measured")
+SETS = ("simulated", "measured")
 """Test sets: the pipeline's held-out sequences, the same pictures under harder motion, measured polarization."""
 
 INTERVAL = (0.025, 0.975)  # quantiles of the bootstrap: 95 %

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 
-from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, reduced
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, over_time
 from polarnet.events.stream import Events, crop
 from polarnet.recordings.source import RecordingError
 
@@ -200,13 +200,10 @@ def redundancy_shifts(
     The shifts come from linearised least squares (Gauss-Newton) and have mean 0. Shifts that the scene does not
     determine, because all four captures see the same, stay near 0.
     """
-    from scipy.interpolate import make_interp_spline  # half a second, which every stage would pay
-
-    lines = []
-    for capture, start in zip(captures, start_us.tolist(), strict=True):
-        chosen = _pictures_after(capture, start)
-        pictures = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
-        lines.append(make_interp_spline(capture.t_us[chosen] - start, pictures, k=1))
+    lines = [
+        over_time(capture, start, config, _pictures_after(capture, start))
+        for capture, start in zip(captures, start_us.tolist(), strict=True)
+    ]
     slopes_of = [line.derivative() for line in lines]
     first, last = max(line.t[0] for line in lines), min(line.t[-1] for line in lines)
     margin = 1000 * config.refine_within_ms / 2

@@ -6,7 +6,7 @@ landmark enters a region of the picture. That moment is time 0 of the clock that
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -178,6 +178,16 @@ def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float3
     """The crop of a picture, averaged over areas to the final size, 0 to 255."""
     small = cv2.resize(crop.astype(np.float32), tuple(config.size[::-1]), interpolation=cv2.INTER_AREA)
     return small / np.float32(STEPS_OF_8_BITS)
+
+
+def over_time(
+    capture: IntensityCapture, start_us: float | int, config: RecordingsConfig, chosen: slice = slice(None)
+) -> Any:
+    """The reduced pictures as a function of the time since `start_us`: linear between two pictures, and beyond them."""
+    from scipy.interpolate import make_interp_spline  # half a second, which every stage would pay
+
+    pictures = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
+    return make_interp_spline(capture.t_us[chosen] - start_us, pictures, k=1)
 
 
 def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> UInt16[np.ndarray, "h2 w2"]:

@@ -24,9 +24,9 @@ from polarnet.captures.dot import (
     find_captures,
     given_starts,
     landmark_starts,
+    over_time,
     read_event_capture,
     read_intensity_capture,
-    reduced,
     region_negative_times_us,
 )
 from polarnet.events.stream import Events, crop, downscale, slice_time
@@ -177,15 +177,8 @@ def aligned(
         channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
     planes = []
     for name in INTENSITY_CAPTURES:
-        pictures, own_us = target.intensities[name], t_us + calibrated.start_us[name]
-        k = np.clip(np.searchsorted(pictures.t_us, own_us, side="right") - 1, 0, len(pictures.t_us) - 2)
-        share = (own_us - pictures.t_us[k]) / (pictures.t_us[k + 1] - pictures.t_us[k])
-        frames = [
-            (1 - s) * reduced(np.asarray(pictures.pictures[before]), config)
-            + s * reduced(np.asarray(pictures.pictures[before + 1]), config)
-            for before, s in zip(k.tolist(), share.tolist(), strict=True)
-        ]
-        planes.append(torch.from_numpy(np.stack(frames)).float().div_(WHITE).clamp_(0, 1))
+        frames = over_time(target.intensities[name], calibrated.start_us[name], config)(t_us)
+        planes.append(torch.from_numpy(frames).float().div_(WHITE).clamp_(0, 1))
     return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
 
 

@@ -6,24 +6,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from polarnet.characterization.intervals import (
-    GROUPS,
-    Estimate,
-    between_shot_noise_us,
-    by_pixel,
-    chosen_pixels,
-    intervals_of,
-    piled_up_us,
-)
-from polarnet.characterization.light import FlickerRecording, Source, increments_of, source_of
-from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
-from polarnet.characterization.thresholds import (
+from polarnet.characterization.flicker import (
+    FlickerRecording,
     PixelThresholds,
+    Source,
     bandwidth,
     correlation,
     deviation,
+    increments_of,
+    source_of,
     thresholds_without_leak,
 )
+from polarnet.characterization.intervals import GROUPS, Estimate, by_pixel, chosen_pixels, intervals_of, piled_up_us
+from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.terminal.progress import ProgressBar
@@ -53,6 +48,11 @@ class SensorFit:
         else:
             self.estimates[name] = estimate
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones."""
+        return {name: float(f"{one.value:.4g}") for name, one in self.estimates.items()}
+
 
 def fit_sensor(
     static: Events | None, static_light: float, flickers: Sequence[FlickerRecording], pixel: PixelConfig
@@ -76,12 +76,10 @@ def fit_sensor(
         if noise.swing > MAX_SWING:
             fit.notes.append(
                 f"the rate of OFF events in the static recording varies by {noise.swing:.0%} beyond chance: its light "
-                f"was not constant, so its noise, hot pixels and refractory period mean nothing; record a still scene"
+                f"was not constant, so its noise and hot pixels mean nothing; record a still scene"
             )
-    durations_us = [intervals_of(one).duration_us for one in ordered]
-    dead_time = piled_up_us(durations_us) or (between_shot_noise_us(durations_us[0]) if noise else None)
-    reason = "intervals between a pixel's events do not pile up at a minimum, and shot noise is too rare to show it"
-    fit.enter("refractory_period_us", dead_time, reason)
+    dead_time = piled_up_us([intervals_of(one).duration_us for one in ordered])
+    fit.enter("refractory_period_us", dead_time, "intervals between a pixel's events do not pile up at a minimum")
     leak = noise.leak if noise else None
     leak = leak if leak and leak.error <= MAX_LEAK_ERROR * leak.value else None
     reason = "under constant light, shot noise comes before the leak; record brighter"
@@ -101,7 +99,7 @@ def fit_sensor(
 
 def _fit_flicker(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
     """Enter bandwidth and thresholds; returns the relative deviations of the ON and OFF thresholds."""
-    pixels = sources[0].events.pixels
+    pixels = sources[0].pixels
     names = " and ".join(source.name for source in sources)
     cutoff = bandwidth(sources, leak_hz)
     fit.enter("cutoff_hz", cutoff, "the light changes too slowly; add a flicker near the bandwidth")

@@ -16,8 +16,6 @@ GROUPS = 8  # groups of pixels, whose differences give standard errors
 MAX_RELATIVE_ERROR = 0.5  # an estimate with a larger standard error is discarded
 PILE_UP = 3.0  # intervals of 0.9 to 1.1 times the shortest, over those of 1.1 to 1.3 times the shortest
 MIN_TICKS = 5  # ticks of the recording's clock in the shortest refractory period that can be measured
-SHORTEST = 5  # rank of the interval that shot noise is judged by, so that a few false events do not count
-MAX_ERROR = 0.05  # relative; without a refractory period the error is about as large as the estimate
 
 
 class Estimate(NamedTuple):
@@ -40,14 +38,22 @@ class PixelEvents(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """Pairs of consecutive events of one pixel. `start` and `stop` index `PixelEvents`."""
+    """Pairs of consecutive events of one pixel, pixel by pixel."""
 
-    start: Int64[np.ndarray, " m"]
-    stop: Int64[np.ndarray, " m"]
     pixel: Int64[np.ndarray, " m"]
     on: Bool[np.ndarray, " m"]
     """Polarity of the event at the end."""
-    duration_us: Float64[np.ndarray, " m"]
+    start_us: Float64[np.ndarray, " m"]
+    stop_us: Float64[np.ndarray, " m"]
+
+    @property
+    def duration_us(self) -> Float64[np.ndarray, " m"]:
+        """Time from the first event to the second."""
+        return self.stop_us - self.start_us
+
+    def chosen(self, which: Bool[np.ndarray, " m"] | slice) -> "Intervals":
+        """Some of the intervals."""
+        return Intervals(*(column[which] for column in self))
 
 
 def by_pixel(events: Events) -> PixelEvents:
@@ -70,9 +76,8 @@ def chosen_pixels(events: PixelEvents, chosen: Bool[np.ndarray, " pixels"]) -> P
 
 def intervals_of(events: PixelEvents) -> Intervals:
     """All pairs of consecutive events of a pixel."""
-    start = np.flatnonzero(events.pixel[1:] == events.pixel[:-1])
-    stop = start + 1
-    return Intervals(start, stop, events.pixel[stop], events.on[stop], events.t_us[stop] - events.t_us[start])
+    same = events.pixel[1:] == events.pixel[:-1]
+    return Intervals(events.pixel[1:][same], events.on[1:][same], events.t_us[:-1][same], events.t_us[1:][same])
 
 
 def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3) -> Intervals:
@@ -83,10 +88,8 @@ def undisturbed(intervals: Intervals, refractory_us: float, margin: float = 1.3)
     """
     free = intervals.duration_us > margin * refractory_us
     after_waiting = np.zeros(len(free), bool)
-    follows = intervals.start[1:] == intervals.stop[:-1]
-    after_waiting[1:] = follows & ~free[:-1]
-    usable = free & ~after_waiting
-    return Intervals(*(column[usable] for column in intervals))
+    after_waiting[1:] = (intervals.pixel[1:] == intervals.pixel[:-1]) & ~free[:-1]
+    return intervals.chosen(free & ~after_waiting)
 
 
 def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate | None:
@@ -105,23 +108,6 @@ def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate |
         return None
     near = durations[edges[0] : edges[1]]
     return Estimate(float(np.median(near)), float(near.std()) / math.sqrt(len(near)), "shortest intervals of a pixel")
-
-
-def between_shot_noise_us(durations_us: Float64[np.ndarray, " _"]) -> Estimate | None:
-    """Refractory period from intervals under constant light.
-
-    Shot noise is a Poisson process that pauses for the refractory period. Just above it, the density of intervals is
-    constant, so the k-th shortest interval exceeds it by k over the density.
-    """
-    durations = np.sort(durations_us[durations_us > 0])
-    if len(durations) < SHORTEST:
-        return None
-    shortest = durations[SHORTEST - 1]
-    density = (np.searchsorted(durations, 3 * shortest) - SHORTEST) / (2 * shortest)
-    value, error = shortest - SHORTEST / max(density, 1e-12), math.sqrt(SHORTEST) / max(density, 1e-12)
-    if error > MAX_ERROR * value or shortest < MIN_TICKS * _tick_us(durations):
-        return None
-    return Estimate(float(value), float(error), "shortest intervals of shot noise")
 
 
 def _tick_us(durations: Float64[np.ndarray, " _"]) -> float:

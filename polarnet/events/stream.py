@@ -3,15 +3,14 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import no_type_check
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int8, Int16, Int64, Integer
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, whole_numbers
+from polarnet.runtime.compilation import compiled
 
 MAX_SIDE = 2**15 - 1  # pixels; coordinates are int16
 
@@ -94,8 +93,7 @@ def validate(events: Events) -> Events:
     return events
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _all_valid(t, x, y, p, height, width) -> bool:
     """The check of `validate` in one pass, without a branch per event."""
     wrong, before = False, t[0] if t.size else 0
@@ -181,8 +179,7 @@ def _joined(streams: Sequence[Events]) -> Events:
     return Events(t, x, y, p, *sizes.pop())
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _fires(y, x, p, sums, threshold):
     """Mask of the events at which a coarse pixel fires, each time that its polarity sum has moved by `threshold`."""
     fired = np.zeros(len(p), dtype=np.bool_)

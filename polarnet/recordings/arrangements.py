@@ -1,8 +1,8 @@
 """Turn files of any polarizer arrangement into four channels on one clock, whole or in pieces of constant memory.
 
-An arrangement is either four files, one per angle and in any order (four cameras, or one camera four times), or one
-file of a camera with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets`
-handles division-of-time captures.
+An arrangement is either four files of cameras on one clock, one per angle and in any order, or one file of a camera
+with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets` handles
+division-of-time captures, each with its own clock.
 """
 
 import os
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, select, slice_count
+from polarnet.events.stream import Events, slice_count
 from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -80,35 +80,18 @@ def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int |
 
 
 def open_four(
-    files: Mapping[int, str | os.PathLike[str]],
-    start_us: Mapping[int, int] | None = None,
-    open_file: Open = open_recording,
+    files: Mapping[int, str | os.PathLike[str]], open_file: Open = open_recording, origin_us: int | None = None
 ) -> Channels:
-    """The channels of `read_four`, in pieces."""
+    """The channels of `read_four`, in pieces; time 0 is `origin_us` (None: the earliest of all events)."""
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
         raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
-    if start_us is not None and set(start_us) != set(files):
-        raise RecordingError(f"expected a start for each of the angles {sorted(files)}, got {sorted(start_us)}")
-    angles = [by_angle[angle] for angle in POLARIZER_ANGLES_DEG]
-    readers = [open_file(Path(files[angle])) for angle in angles]
+    readers = [open_file(Path(files[by_angle[angle]])) for angle in POLARIZER_ANGLES_DEG]
     sizes = {(reader.height, reader.width) for reader in readers}
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
     nothing = Events.empty(*sizes.pop())
-    if start_us is None:
-        return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers)
-    starts = [start_us[angle] for angle in angles]
-    return Channels(
-        nothing.height, nothing.width, lambda: _together(map(_from, readers, starts), nothing), readers, origin_us=0
-    )
-
-
-def _from(chunks: Iterable[Events], start_us: int) -> Iterator[Events]:
-    """The events from a time on, which becomes time 0."""
-    for events in chunks:
-        if len(later := select(events, events.t >= start_us)):
-            yield shifted(later, start_us)
+    return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers, origin_us)
 
 
 def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[list[Events]]:
@@ -123,11 +106,10 @@ def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[
         heads = [rest if len(rest) else next(stream, nothing) for rest, stream in zip(rests, streams, strict=True)]
 
 
-def read_four(files: Mapping[int, str | os.PathLike[str]], start_us: Mapping[int, int] | None = None) -> list[Events]:
+def read_four(files: Mapping[int, str | os.PathLike[str]]) -> list[Events]:
     """The four channels, in the order 0, 45, 90, 135 degrees, from files keyed by polarizer angle.
 
-    Angles are in degrees and count modulo 180. `start_us` gives the start of the common clock in each file's own clock;
-    earlier events are left out. Without it the files share one clock, whose time 0 is the earliest of all events.
+    Angles are in degrees and count modulo 180. The files share one clock, whose time 0 is the earliest of all events.
     RecordingError where an angle is missing or duplicated, or where the sensor sizes differ.
 
     >>> from pathlib import Path
@@ -136,7 +118,7 @@ def read_four(files: Mapping[int, str | os.PathLike[str]], start_us: Mapping[int
     >>> [len(channel) for channel in read_four(dict.fromkeys((0, 45, 90, 135), "night.txt"))]
     [1, 1, 1, 1]
     """
-    return open_four(files, start_us).whole()
+    return open_four(files).whole()
 
 
 def open_mosaic(path: str | os.PathLike[str], mosaic: Mosaic, open_file: Open = open_recording) -> Channels:

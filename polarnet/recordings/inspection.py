@@ -2,9 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Int64, UInt16
 
@@ -13,6 +11,7 @@ from polarnet.recordings.formats.celex5 import celex5_pictures
 from polarnet.recordings.noise import hot_pixels
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS
+from polarnet.runtime.compilation import compiled
 
 EVENTS_PER_PIXEL = 0.15  # in the part shown: enough to see edges, few enough not to smear them
 WORST_PIXELS = 4  # hot pixels named in the findings
@@ -78,8 +77,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
     return one
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _tally(t, x, y, p, counts, before):
     """Count the events of each pixel; returns the number of ON events, the longest silence and its end."""
     on, longest, end = 0, 0, before

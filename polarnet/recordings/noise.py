@@ -6,9 +6,8 @@ that moves over a pixel moves over the pixels around it too (Delbruck, "Frame-fr
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
@@ -16,6 +15,7 @@ from jaxtyping import Bool, Int
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, select
 from polarnet.recordings.arrangements import Piece
+from polarnet.runtime.compilation import compiled
 from polarnet.stokes import Mosaic
 
 FOUND = "found"
@@ -167,8 +167,7 @@ def never(events: Events) -> np.ndarray:
     return np.full((events.height + 2, events.width + 2), NEVER)
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _supported(t, x, y, within_us, last):
     keep = np.zeros(len(t), np.bool_)
     for i in range(len(t)):

@@ -23,7 +23,7 @@ BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # blocks with events: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
 DISTURBING_HZ = 10_000.0  # events a second of a pixel; more change the shipped network's DoLP far from the pixel
 
-# Limits of misfits and counts: measured by studies/polarizers.py (docs/recover.md, section Checks).
+# Limits of misfits and counts (docs/recover.md, section Checks)
 BETTER_FIT = 0.9  # misfit of other pairs over that of the pairs at right angles: lower only where the order is wrong
 EQUAL_COUNTS = 1.1  # events of the busiest channel over those of the quietest: lower without polarization
 EQUAL_MISFITS = 1.1  # misfit of other pairs over that of the pairs at right angles: lower without polarization ...

@@ -6,14 +6,13 @@ Every repair is counted. The outcome of a file depends on the file alone, not on
 import logging
 from collections import Counter
 from collections.abc import Collection, Iterator
-from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Bool
 
 from polarnet.events.streaming import MAX_PAUSE_US
 from polarnet.recordings.source import REPAIRS, SAFE, Block, Blocks, Counts, RecordingError, joined
+from polarnet.runtime.compilation import compiled
 
 LATE_US = 10_000
 """Events late by at most this are put in order: packets overtake each other, clocks do not."""
@@ -217,8 +216,7 @@ class Clock:
         )
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _judge(t, keep, started, newest, floor, dropped, few, final):
     """Mark the events with credible times in `keep`, up to one that needs events not yet there.
 
@@ -264,8 +262,7 @@ def _judge(t, keep, started, newest, floor, dropped, few, final):
     return i, False, started, newest, dropped, counts
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _back(t, i, low, high, final):
     """Index of the event that brings time back into [low, high) after event `i`, for at least as long as it was away.
 

@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from polarnet.events.stream import MAX_SIDE
+from polarnet.runtime.compilation import compiled
 
 BLOCK_EVENTS = 2**18  # events that a format decodes at a time; chunks handed to a user are cut anew
 
@@ -196,8 +196,7 @@ def unwrapped(blocks: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, np.nda
         yield t[: len(block)], block
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _unwrap(t, count, state):
     """Add the wraps to the first `count` times; `state` holds the wraps and the last credible stamp."""
     wraps, before = state

@@ -9,12 +9,12 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias, no_type_check
+from typing import Any, TypeAlias
 
-import numba
 import numpy as np
 
 from polarnet.events.stream import Events, slice_count
+from polarnet.runtime.compilation import compiled, inlined
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.events import EventStore
 from polarnet.terminal.installation import installation
@@ -159,8 +159,7 @@ def _blocks(events: Recorded, form: str, max_us: int) -> Iterator[Events]:
             yield block
 
 
-@no_type_check
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _encode_text(t, x, y, p, text):
     """Write the lines of `write_text`; returns their number of bytes."""
     n = 0
@@ -176,8 +175,7 @@ def _encode_text(t, x, y, p, text):
     return n
 
 
-@no_type_check
-@numba.njit(nogil=True, cache=True, inline="always")
+@inlined
 def _digits(value, least, text, n):
     """Write at least `least` digits of a number at place `n`; returns the place after them."""
     length, rest = 1, value // 10
@@ -189,8 +187,7 @@ def _digits(value, least, text, n):
     return n + length
 
 
-@no_type_check
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _encode_evt3(t, x, y, p, start, state, words):
     """Fill `words` with the events from `start` on; returns the first event that did not fit, and the number of words.
 

@@ -145,7 +145,7 @@ def _channels(files: Files, work: Path) -> Channels:
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captured(path, work, files.captures)
     if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return open_four(exported, dict.fromkeys(exported, 0), files.open)  # times count from the sequence's start
+        return open_four(exported, files.open, origin_us=0)  # times count from the sequence's start
     if (path / METADATA).is_file():
         store = EventStore.open(path)
         return _stored(store, _named(files.sequence, store.sequences, path.name))

@@ -35,7 +35,6 @@ SOURCE_NAMES = {
     "polarization": "of measured polarization",
 }
 SET_ABOUT = {
-    "complex_motion": "The same held-out pictures while the camera turns, zooms and moves faster (section sets).",
     "measured": "Scenes whose polarization a camera measured, seen by a simulated event camera: real DoLP and AoLP, "
     "simulated events.",
     "recordings": "Captures of real targets (paper, section 4): real events, DoLP from pictures of the same camera.",

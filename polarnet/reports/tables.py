@@ -52,7 +52,6 @@ PARTS_AND_COSTS = {
 
 SET_TITLES = {
     "simulated": "Simulated",
-    "complex_motion": "Complex motion",
     "measured": "Measured polarization",
     "recordings": "Real targets",
 }

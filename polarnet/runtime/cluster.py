@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from polarnet.runtime.machine import end_with_parent, limit_threads, tune, usable_cores
+from polarnet.runtime.machine import end_with_parent, limit_threads, on_one_thread, tune, usable_cores
 from polarnet.terminal.installation import installation
 from polarnet.terminal.progress import ProgressBar as Bar
 from polarnet.terminal.progress import within
@@ -149,7 +149,8 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
             f"cluster.address needs Dask on this machine and on the workers: {installation('cluster')}"
         ) from None
     with Client(address, timeout="30s") as client:
-        futures = client.map(functools.partial(_on_one_thread, function), items, retries=ATTEMPTS - 1, pure=False)
+        one_by_one = functools.partial(on_one_thread, function)  # Dask runs several tasks of one worker side by side
+        futures = client.map(one_by_one, items, retries=ATTEMPTS - 1, pure=False)
         order: dict[Any, int] = {future.key: i for i, future in enumerate(futures)}
         results: dict[int, Result] = {}
         for future, result in dask_as_completed(futures, with_results=True):
@@ -158,8 +159,3 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
             results[order[future.key]] = result
             bar.update()
     return [results[i] for i in range(len(items))]
-
-
-def _on_one_thread(function: Callable[[Item], Result], item: Item) -> Result:
-    limit_threads(1)  # Dask runs several tasks of one worker side by side
-    return function(item)

@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import platform
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,12 +37,6 @@ class RuntimeConfig:
     """Threads of torch and numba in each process; 0: one per core."""
     workers: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes that share the sequences."""
-    devices: Annotated[int, Field(gt=0, le=4096)]
-    """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""
-    nodes: Annotated[int, Field(gt=0, le=4096)]
-    """Number of machines that share a training; the same command starts on each."""
-    rendezvous: str
-    """Address at which the machines meet: host:port of one of them."""
 
 
 def seed_for(seed: int, name: str, purpose: str) -> int:
@@ -59,17 +52,14 @@ def generator_for(seed: int, name: str, purpose: str) -> np.random.Generator:
 
 def usable_cores() -> int:
     """Number of cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0))
 
 
 def memory() -> tuple[int, int]:
-    """Free and total memory of this machine in bytes; only Linux states how much is free, others count as empty."""
-    if sys.platform == "linux":
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
-        return free, total
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return total, total
+    """Free and total memory of this machine in bytes."""
+    lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+    free, total = (1024 * int(lines[key].split()[0]) for key in ("MemAvailable", "MemTotal"))
+    return free, total
 
 
 def limit_threads(threads: int) -> None:
@@ -103,17 +93,9 @@ def threads_of(config: RuntimeConfig) -> int:
     return config.threads or max(1, usable_cores() // config.workers)
 
 
-def processes_here() -> int:
-    """Number of processes on this machine that share this training (polarnet.training.engine.parallel)."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-
-
 def device_of(config: RuntimeConfig) -> torch.device:
     """The torch device that `config.device` names; ValueError if it asks for a GPU and there is none."""
-    own_gpu = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"  # torchrun's number of this process
-    if config.device == "auto":
-        return torch.device(own_gpu if torch.cuda.is_available() else "cpu")
-    device = torch.device(own_gpu if config.device == "cuda" else config.device)
+    device = torch.device(config.device if config.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"runtime.device={config.device}: torch {torch.__version__} sees no GPU; use device=cpu")
     return device
@@ -135,12 +117,10 @@ def precision_on(device: torch.device, precision: str) -> str:
 
 
 def end_with_parent(parent: int | None = None) -> None:
-    """Let Linux kill this process when the one that started it ends, however that ends; no effect on other systems.
+    """Let the system kill this process when the one that started it ends, however that ends.
 
     That one may have ended already: `parent` is its process number; None: multiprocessing knows it.
     """
-    if sys.platform != "linux":
-        return
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     starter = multiprocessing.parent_process()
     lives = os.getppid() == parent if parent is not None else starter is None or starter.is_alive()
@@ -181,7 +161,7 @@ def tune() -> None:
 
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory and request deterministic kernels; returns the device to run on."""
-    limit_threads(config.threads or max(1, usable_cores() // processes_here()))
+    limit_threads(config.threads or usable_cores())
     tune()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -17,6 +17,8 @@ from polarnet.storage.scenes import SceneStore
 from polarnet.terminal.progress import steps
 
 Mapper = Callable[..., Iterable[Any]]
+Emulated = tuple[list[Events], int, dict[str, Any], Tensor | None]
+"""Channels of a sequence, its duration in microseconds, the camera's drawn values and the analyzers of its pixels."""
 
 
 def emulate_scenes(
@@ -26,44 +28,28 @@ def emulate_scenes(
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
     emulates one part on `threads` threads. The event store has the parts of the scene store. After an interruption, a
-    run of the same scenes, camera and seed makes the missing parts.
+    run of the same scenes, camera and seed makes the missing parts. The noise of a sequence, and with `randomise` its
+    camera, depend only on the seed and the sequence's name.
     """
     source = SceneStore.open(scenes)
     size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
     store = EventStore.create(
         events, source.sequences, *size, origin_of(source, camera, seed), source.sequences_per_part
     )
-    emulated = functools.partial(_emulated, source, camera, seed, threads)
-    return fill_store(store, source, emulated, camera, seed, mapper)
+    return fill_store(store, functools.partial(_emulated, source, camera, seed, threads), mapper)
 
 
-def fill_store(
-    store: EventStore,
-    scenes: SceneStore,
-    emulated: Callable[[str], tuple[list[Events], Tensor | None]],
-    camera: Camera,
-    seed: int,
-    mapper: Mapper,
-) -> int:
-    """Write the events and analyzers of each sequence that is missing in a store; returns the number of sequences."""
-    task = functools.partial(_fill_part, scenes=scenes, events=store, emulated=emulated, camera=camera, seed=seed)
-    for _ in mapper(task, store.missing_parts()):
+def fill_store(store: EventStore, emulated: Callable[[str], Emulated], mapper: Mapper) -> int:
+    """Write each sequence that is missing in a store; returns the number of sequences."""
+    for _ in mapper(functools.partial(_fill_part, store, emulated), store.missing_parts()):
         pass
     store.finish()
     return len(store.sequences)
 
 
-def _fill_part(
-    part: str,
-    scenes: SceneStore,
-    events: EventStore,
-    emulated: Callable[[str], tuple[list[Events], Tensor | None]],
-    camera: Camera,
-    seed: int,
-) -> None:
-    for sequence in steps(events.parts[part]):
-        channels, analyzer = emulated(sequence)
-        events.write(sequence, channels, scenes.duration_us(sequence), camera.draws(seed, sequence), analyzer)
+def _fill_part(store: EventStore, emulated: Callable[[str], Emulated], part: str) -> None:
+    for sequence in steps(store.parts[part]):
+        store.write(sequence, *emulated(sequence))
 
 
 def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
@@ -71,21 +57,11 @@ def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
     return {**camera.sections, "seed": seed, "scenes": scenes.attributes, "scenes_sha256": scenes.header["checksum"]}
 
 
-def _emulated(
-    scenes: SceneStore, camera: Camera, seed: int, threads: int, sequence: str
-) -> tuple[list[Events], Tensor | None]:
-    analyzer = pixel_analyzers(camera.drawn(seed, sequence), scenes.sensor_height, scenes.sensor_width)
-    return emulate_sequence(scenes, sequence, camera, seed, threads), analyzer
-
-
-def emulate_sequence(scenes: SceneStore, sequence: str, camera: Camera, seed: int, threads: int) -> list[Events]:
-    """Events of the four channels of one stored sequence.
-
-    Its noise, and with `randomise` its camera, depend only on the seed and the sequence's name.
-    """
+def _emulated(scenes: SceneStore, camera: Camera, seed: int, threads: int, sequence: str) -> Emulated:
+    drawn, size = camera.drawn(seed, sequence), (scenes.sensor_height, scenes.sensor_width)
     scene, trajectory, duration_us = motion_over(scenes, sequence)
-    size = scenes.sensor_height, scenes.sensor_width
-    return emulate_motion(camera.drawn(seed, sequence), scene, trajectory, duration_us, size, threads)
+    channels = emulate_motion(drawn, scene, trajectory, duration_us, size, threads)
+    return channels, duration_us, camera.draws(seed, sequence), pixel_analyzers(drawn, *size)
 
 
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:

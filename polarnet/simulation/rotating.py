@@ -14,7 +14,7 @@ from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera, Grid, grid, read_out
-from polarnet.simulation.dataset import Mapper, fill_store, motion_over, origin_of
+from polarnet.simulation.dataset import Emulated, Mapper, fill_store, motion_over, origin_of
 from polarnet.simulation.emulator import Channels, emulate_frames
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, checked_pose, render_times_us, rendered_chunks
@@ -84,13 +84,13 @@ def emulate_rotating_scenes(
     attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
     size, per_part = (pixels.height, pixels.width), source.sequences_per_part
     store = EventStore.create(events, source.of_split("test"), *size, attributes, per_part)
-    emulated = functools.partial(_emulate_stored, source, rotating, camera, seed, pixels)
-    return fill_store(store, source, emulated, camera, seed, mapper)
+    return fill_store(store, functools.partial(_emulated, source, rotating, camera, seed, pixels), mapper)
 
 
-def _emulate_stored(
+def _emulated(
     scenes: SceneStore, rotating: RotatingConfig, camera: Camera, seed: int, pixels: Grid, sequence: str
-) -> tuple[list[Events], None]:
-    drawn = camera.drawn(seed, sequence, "rotating")
-    output = emulate_rotating(rotating, drawn, *motion_over(scenes, sequence), pixels)
-    return [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)], None
+) -> Emulated:
+    over_scene = motion_over(scenes, sequence)
+    output = emulate_rotating(rotating, camera.drawn(seed, sequence, "rotating"), *over_scene, pixels)
+    channels = [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)]
+    return channels, over_scene[-1], camera.draws(seed, sequence), None

@@ -1,9 +1,8 @@
-"""Test sets beside the pipeline's own: harder motion over held-out pictures, measured polarization, a user's folder.
+"""Test sets beside the pipeline's own, of measured polarization or a user's photographs.
 
 A set is a folder with images, scenes.zarr, frames.zarr and events.zarr, made by the same code as the pipeline's own.
 """
 
-import functools
 import json
 import logging
 import shutil
@@ -14,16 +13,15 @@ from typing import Any
 
 from polarnet.pictures.images import extension, picture_extensions
 from polarnet.pictures.ingest import IngestConfig, files_under, ingest
-from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.pictures.polarimetry import are_measurements, group_by_measurement
-from polarnet.runtime.files import changed_files, code_digest, seal, sha256
+from polarnet.runtime.files import SUMS, changed_files, code_digest, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
 from polarnet.simulation.dataset import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import Synthesis, synthesize
 
-MADE = "made.json"
+MADE = "made.json"  # everything that determines a set; the set is complete once it is sealed
 
 logger = logging.getLogger(__name__)
 
@@ -33,16 +31,10 @@ MakeMapper = Callable[[str], Callable[..., Iterable[Any]]]
 
 @section
 class SetsConfig:
-    """Section `sets` of params.yaml: how test sets beyond `simulated` differ from it."""
+    """Section `sets` of params.yaml."""
 
     measured_root: str
     """Folder of the measurements for the test set `measured`, searched recursively."""
-    rotation_max_deg: float
-    """This field and the next four replace those of `synthesize` in the motion of `complex_motion`."""
-    zoom_max: float
-    speed_min_px_s: float
-    speed_max_px_s: float
-    acceleration_max_px_s2: float
 
 
 @dataclass(frozen=True)
@@ -57,28 +49,46 @@ class Recipe:
     sequences_per_part: int  # sequences in a part of a store; changes no result
 
 
-def make_complex_motion(images: Path, folder: Path, sets: SetsConfig, recipe: Recipe, mapper: MakeMapper) -> bool:
-    """Make a test set of the test pictures of `images` under the motion of `sets`; False if it is complete already."""
-    harder = {name: value for name, value in asdict(sets).items() if name != "measured_root"}
-    recipe = replace(recipe, motion=replace(recipe.motion, **harder))
-    return _make(folder, recipe, mapper, functools.partial(_hold_out, images), _content(images))
-
-
 def make_folder_set(
     root: Path, kind: str, folder: Path, recipe: Recipe, mapper: MakeMapper, limit: int | None = None
 ) -> bool:
     """Make a test set of all photographs or measured scenes under `root`; False if it is complete already.
 
     At most `limit` pictures are chosen by content hash. `kind` is photographs, polarization, or auto, which looks at
-    the files. ValueError if no picture can be used.
+    the files. A stopped run with the same settings, seed and pictures is resumed. A folder made with others, or by
+    other code, is emptied first, as is one whose files have changed since, with a warning. ValueError if no picture can
+    be used.
     """
     if not root.is_dir():
         actual = "a file" if root.exists() else "no such folder"
         raise ValueError(f"{root}: expected a folder of photographs or of measured polarization, got {actual}")
     source = "polarization" if (kind if kind != "auto" else kind_of(root)) == "polarization" else "folder"
     chosen = replace(recipe.ingest, source=source, root=str(root), limit=limit, val_fraction=0.0, test_fraction=1.0)
-    recipe = replace(recipe, ingest=chosen)
-    return _make(folder, recipe, mapper, lambda to: ingest(chosen, recipe.seed, to, mapper("ingest")), _content(root))
+    sections = {"ingest": asdict(chosen), "motion": asdict(recipe.motion), **recipe.camera.sections}
+    settings = sections | {"seed": recipe.seed, "source": _content(root), "code": code_digest()}
+    note, made = folder / MADE, json.dumps(settings, sort_keys=True)
+    if note.exists():
+        complete, same = (folder / SUMS).exists(), note.read_bytes() == made.encode()
+        changed = changed_files(folder) if complete else []
+        for problem in changed:
+            logger.warning("%s; making the set again", problem.partition(";")[0])
+        if complete and same and not changed:
+            return False
+        if changed or not same:
+            shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    note.write_text(made)
+    images, scenes, frames, events = (folder / name for name in ("images", "scenes.zarr", "frames.zarr", "events.zarr"))
+    if not (images / "manifest.json").exists():
+        ingest(chosen, recipe.seed, images, mapper("ingest"))
+    if not (scenes.exists() and frames.exists()):
+        size, polarizers = recipe.sequences_per_part, recipe.camera.polarizers
+        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, polarizers=polarizers)
+        synthesize(synthesis, scenes, frames, mapper("synthesize"))
+    if not events.exists():
+        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
+    seal(folder)
+    return True
 
 
 def kind_of(root: Path) -> str:
@@ -91,60 +101,7 @@ def kind_of(root: Path) -> str:
     return "polarization" if are_measurements(group_by_measurement(files)) else "photographs"
 
 
-def _make(folder: Path, recipe: Recipe, mapper: MakeMapper, fill: Callable[[Path], Any], source: str) -> bool:
-    """Fill `folder`, resuming a stopped run with the same settings, seed and source pictures; False if it is complete.
-
-    `fill` writes the pictures into a folder, and `source` is the hash of its input. A folder made with other settings
-    or input, or by other code, is emptied first, as is one whose files have changed since, with a warning.
-    """
-    sections = {"ingest": asdict(recipe.ingest), "motion": asdict(recipe.motion), **recipe.camera.sections}
-    settings = sections | {"seed": recipe.seed, "source": source, "code": code_digest()}
-    key = sha256(json.dumps(settings, sort_keys=True).encode())
-    note = folder / MADE
-    if note.exists():
-        try:
-            progress = dict(json.loads(note.read_bytes()))
-        except (TypeError, ValueError):  # damaged
-            progress = {}
-        changed = changed_files(folder) if progress.get("complete") else []
-        for problem in changed:
-            logger.warning("%s; making the set again", problem.partition(";")[0])
-        if progress == {"key": key, "complete": True} and not changed:
-            return False
-        if progress.get("key") != key or changed:
-            shutil.rmtree(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps({"key": key, "complete": False}))
-    images, scenes, frames, events = (folder / name for name in ("images", "scenes.zarr", "frames.zarr", "events.zarr"))
-    if not (images / "manifest.json").exists():
-        fill(images)
-    if not (scenes.exists() and frames.exists()):
-        size, polarizers = recipe.sequences_per_part, recipe.camera.polarizers
-        synthesis = Synthesis(images, recipe.motion, recipe.seed, size, polarizers=polarizers)
-        synthesize(synthesis, scenes, frames, mapper("synthesize"))
-    if not events.exists():
-        emulate_scenes(scenes, events, recipe.camera, recipe.seed, mapper("emulate"), recipe.threads)
-    note.write_text(json.dumps({"key": key, "complete": True}))
-    seal(folder)
-    return True
-
-
 def _content(folder: Path) -> str:
     """Hash of the names and bytes of all files in a folder."""
     files = [path for path in files_under(folder) if path.is_file()]
     return sha256(*(f"{path.relative_to(folder)} {sha256(path)}\n".encode() for path in files))
-
-
-def _hold_out(source: Path, images: Path) -> None:
-    """Copy the test pictures of `source`, with a manifest of them alone."""
-    manifest = read_manifest(source)
-    held_out = tuple(entry for entry in manifest.pictures if entry.split == "test")
-    if not held_out:
-        raise ValueError(f"{source} has no test picture; raise ingest.test_fraction or ingest more pictures")
-    temporary = images.with_name(f"{images.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    for entry in held_out:
-        shutil.copy(source / entry.file, temporary / entry.file)
-    write_manifest(replace(manifest, pictures=held_out), temporary)
-    temporary.rename(images)

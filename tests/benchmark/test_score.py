@@ -89,7 +89,7 @@ def test_skill_is_a_ratio_of_means_against_the_oracle_mean():
     ({"methods": ["zeros", "zeros"]}, "methods: expected at least one and none twice"),
     ({"methods": []}, "methods: expected at least one and none twice"),
     ({"sets": ["measured"]}, "sets: expected simulated and others, none twice"),
-    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, complex_motion, measured, got"),
+    ({"sets": ["simulated", "real"]}, r"sets\[1\]: expected one of simulated, measured, got"),
 ])  # fmt: skip
 def test_settings_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):

@@ -1,4 +1,4 @@
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,12 +6,11 @@ import pytest
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
-from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
-from polarnet.runtime.files import seal
+from polarnet.runtime.files import SUMS
 from polarnet.runtime.machine import generator_for
-from polarnet.simulation.motion import Trajectory
-from polarnet.simulation.sets import MADE, Recipe, SetsConfig, kind_of, make_complex_motion
-from polarnet.storage import EventStore, FrameStore, SceneStore
+from polarnet.simulation.sets import MADE, Recipe, kind_of, make_folder_set
+from polarnet.storage.events import EventStore
+from polarnet.storage.frames import FrameStore
 
 SMALL = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.1", "synthesize.sensor_height=60",
@@ -26,65 +25,60 @@ def recipe(project_root):
 
 
 @pytest.fixture
-def images(tmp_path):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    entries = []
-    for name, split in (("seen", "train"), ("held-out", "test")):
-        write_png(folder / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
-        size = {"height": 100, "width": 150, "source_height": 100, "source_width": 150}
-        origin = {"source": "folder", "origin": name, "sha256": "0" * 64}
-        entries.append(ManifestEntry(name=name, file=f"{name}.png", split=split, bits=8, **origin, **size))
-    write_manifest(Manifest(tuple(entries), (), 0, 0), folder)
-    return folder
+def photographs(tmp_path):
+    deeper = tmp_path / "photographs" / "deeper"
+    deeper.mkdir(parents=True)
+    for name in ("a", "b"):
+        write_png(deeper / f"{name}.png", dead_leaves(generator_for(1, name, "picture"), 100, 150), bits=8)
+    return deeper.parent
 
 
 def plain(label):
     return map
 
 
-def harder(**changes):
-    values = {"rotation_max_deg": 30.0, "zoom_max": 1.2, "speed_min_px_s": 40.0, "speed_max_px_s": 60.0}
-    return SetsConfig(**{"measured_root": "nowhere", **values, "acceleration_max_px_s2": 2000.0, **changes})
+def test_every_picture_of_a_folder_is_for_testing(photographs, tmp_path, recipe):
+    assert make_folder_set(photographs, "auto", tmp_path / "set", recipe, plain)
+    frames, events = (
+        FrameStore.open(tmp_path / "set" / "frames.zarr"),
+        EventStore.open(tmp_path / "set" / "events.zarr"),
+    )
+    assert len(frames.of_split("test")) == 2
+    assert frames.of_split("test") == events.sequences
+    assert all(sum(events.count(name)) > 100 for name in events.sequences)
 
 
-def test_complex_motion_shows_held_out_pictures_alone_turning_and_zooming(images, tmp_path, recipe):
-    folder = tmp_path / "complex_motion"
-    assert make_complex_motion(images, folder, harder(), recipe, plain)
-    frames, events = FrameStore.open(folder / "frames.zarr"), EventStore.open(folder / "events.zarr")
-    assert frames.of_split("test") == events.sequences == ["held-out-00"]
-    scenes = SceneStore.open(folder / "scenes.zarr")
-    trajectory = Trajectory.from_vector(scenes.trajectory("held-out-00"))
-    assert trajectory.roll.amplitude > 0
-    assert trajectory.zoom.amplitude > 0
-    assert 40 <= trajectory.speed_px_s <= 60
-    assert sum(events.count("held-out-00")) > 100
+def test_a_set_is_made_once_and_again_only_when_its_recipe_or_its_pictures_change(photographs, tmp_path, recipe):
+    def make(recipe: Recipe) -> bool:
+        return make_folder_set(photographs, "auto", tmp_path / "set", recipe, plain)
+
+    assert make(recipe)
+    assert not make(recipe)
+    turning = replace(recipe, motion=replace(recipe.motion, rotation_max_deg=10.0))
+    assert make(turning)
+    write_png(photographs / "deeper" / "a.png", np.full((100, 150, 3), 0.5, dtype=np.float32), bits=8)
+    assert make(turning)
 
 
-def test_a_set_is_made_once_and_again_when_stopped_or_its_recipe_changes(images, tmp_path, recipe):
-    folder = tmp_path / "complex_motion"
-    assert make_complex_motion(images, folder, harder(), recipe, plain)
-    assert not make_complex_motion(images, folder, harder(), recipe, plain)
-    note = json.loads((folder / MADE).read_text())
-    (folder / MADE).write_text(json.dumps(note | {"complete": False}))
+def test_a_set_that_was_interrupted_goes_on(photographs, tmp_path, recipe):
+    folder = tmp_path / "set"
+    make_folder_set(photographs, "auto", folder, recipe, plain)
+    (folder / SUMS).unlink()
     before = (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns
-    assert make_complex_motion(images, folder, harder(), recipe, plain)
+    assert make_folder_set(photographs, "auto", folder, recipe, plain)
     assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
-    assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
-    write_png(images / "held-out.png", np.full((100, 150, 3), 0.5, dtype=np.float32), bits=8)
-    seal(images)
-    assert make_complex_motion(images, folder, harder(zoom_max=1.1), recipe, plain)
 
 
-@pytest.mark.parametrize("file", ["images/held-out.png", "frames.zarr/part-00000/dolp/c/0/0/0", MADE])
-def test_a_set_with_a_damaged_file_is_made_again(images, tmp_path, recipe, caplog, file):
-    folder = tmp_path / "complex_motion"
-    make_complex_motion(images, folder, harder(), recipe, plain)
-    whole = (folder / file).read_bytes()
-    (folder / file).write_bytes(whole[:20] + bytes([whole[20] ^ 1]) + whole[21:])
-    assert make_complex_motion(images, folder, harder(), recipe, plain)
-    assert (folder / file).read_bytes() == whole
-    assert file == MADE or f"{folder / file} is not the file that" in caplog.text
+@pytest.mark.parametrize("pattern", ["images/*.png", "frames.zarr/part-00000/dolp/c/0/0/0", MADE])
+def test_a_set_with_a_damaged_file_is_made_again(photographs, tmp_path, recipe, caplog, pattern):
+    folder = tmp_path / "set"
+    make_folder_set(photographs, "auto", folder, recipe, plain)
+    file = next(folder.glob(pattern))
+    whole = file.read_bytes()
+    file.write_bytes(whole[:20] + bytes([whole[20] ^ 1]) + whole[21:])
+    assert make_folder_set(photographs, "auto", folder, recipe, plain)
+    assert file.read_bytes() == whole
+    assert f"{file} is not the file that" in caplog.text
 
 
 @pytest.mark.parametrize(

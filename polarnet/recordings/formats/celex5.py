@@ -15,14 +15,14 @@ import struct
 from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
+from polarnet.runtime.compilation import compiled
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
@@ -222,8 +222,7 @@ def _packages(path: Path, counts: Counts) -> Iterator[tuple[int | None, UInt8[np
             number += 1
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _decode(data, state, last_adc, columns):
     """Decode items of 28 bits: row and time stamp, or intensity and column."""
     row, stamp, now = state

@@ -18,7 +18,7 @@ from polarnet.recordings.source import (
     chosen_part,
 )
 
-FAERY = Library("faery", "faery", "recordings", "the file is damaged")
+FAERY = Library("faery", "faery", "the file is damaged")
 
 
 def open_faery(path: Path, choices: Choices, *, aedat4: bool) -> Source:

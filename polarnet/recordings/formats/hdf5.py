@@ -31,7 +31,6 @@ SETTINGS = ("t_offset", "height", "width", "sensor_resolution", "geometry")
 HDF5 = Library(
     "HDF5",
     "h5py",
-    "recordings",
     "the file is damaged, or compressed with a filter that is not installed: pip install hdf5plugin; for Prophesee's "
     "ECF install the HDF5 plugin of Metavision or OpenEB and name its folder in HDF5_PLUGIN_PATH",
 )

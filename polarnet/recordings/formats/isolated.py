@@ -28,8 +28,6 @@ class Library(NamedTuple):
     name: str
     package: str
     """Package that its tasks import."""
-    extra: str
-    """polarnet's extra that installs the package."""
     advice: str
     """End of the message about an unreadable file."""
 
@@ -55,7 +53,7 @@ def ask(library: Library, path: Path, task: Callable[..., Iterable[Any]], *argum
     imports the task's module. RuntimeError names the package to install where the library is missing.
     """
     if sys.modules.get(library.package, True) is None or importlib.util.find_spec(library.package) is None:
-        raise RuntimeError(f"{path.name}: this format needs {library.package}: {installation(library.extra)}")
+        raise RuntimeError(f"{path.name}: this format needs {library.package}: {installation('recordings')}")
     worker, kind = _ready_worker(), "answer"
     try:
         with contextlib.suppress(OSError):  # a process that has ended has no answer either

@@ -7,6 +7,7 @@ Answers are JSON and the bytes of arrays, since a damaged file may have made the
 import contextlib
 import json
 import os
+import resource
 import signal
 from collections.abc import Iterator, Sequence
 from multiprocessing.connection import Connection
@@ -22,9 +23,7 @@ def serve(pipe: Connection, max_mib: int) -> None:
     """Answer requests, a task and its arguments, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the main process, which then ends this one
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries print about damage; the error is sent
-    with contextlib.suppress(ImportError, ValueError):  # makes larger allocations fail, where the system supports it
-        import resource
-
+    with contextlib.suppress(ValueError):  # above a limit that the process has already
         resource.setrlimit(resource.RLIMIT_AS, (max_mib * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

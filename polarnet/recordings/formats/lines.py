@@ -8,9 +8,8 @@ import itertools
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Int64
 
@@ -25,6 +24,7 @@ from polarnet.recordings.source import (
     start_of,
     unpacked,
 )
+from polarnet.runtime.compilation import compiled
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
 BLOCK_BYTES = 2**22
@@ -236,8 +236,7 @@ def lines_of(table: Int64[np.ndarray, "n columns"], separator: str) -> bytes:
     return "".join([row % tuple(values) for values in table.tolist()]).encode()
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _parse(buffer, start, shift, rows):
     """Fill `rows` from the lines at `start`; returns the number filled, the next offset and the number unreadable."""
     place, filled, unreadable = start, 0, 0
@@ -280,8 +279,7 @@ def _parse(buffer, start, shift, rows):
     return filled, place, unreadable
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _number(buffer, place, shift):
     """Parse the number at `place`, times 10**shift; returns it, its end, and whether it is valid."""
     size, start = len(buffer), place
@@ -292,14 +290,14 @@ def _number(buffer, place, shift):
         return np.int64(letter == 116), place, shift == 0 and place - start == (4 if letter == 116 else 5)
     negative = buffer[place] == 45
     place += negative or buffer[place] == 43
-    value, digits, count, exponent, point = 0, 0, 0, shift, False
+    value, digits, count, exponent, point = np.int64(0), 0, 0, shift, False
     while place < size:
         digit = np.int64(buffer[place]) - 48
         if 0 <= digit <= 9:
             count += 1
             if digits < _DIGITS:
                 value = 10 * value + digit
-                digits += value > 0
+                digits += int(value > 0)
                 exponent -= point
             else:
                 exponent += not point

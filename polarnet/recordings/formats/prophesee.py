@@ -10,9 +10,7 @@ exchanged. As in Prophesee's OpenEB, the header states the order, and where it d
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import no_type_check
 
-import numba
 import numpy as np
 
 from polarnet.recordings.source import (
@@ -26,6 +24,7 @@ from polarnet.recordings.source import (
     unwrapped,
     word_blocks,
 )
+from polarnet.runtime.compilation import compiled
 
 PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
@@ -149,8 +148,7 @@ def _decode_evt2(words: np.ndarray, *state_and_columns: np.ndarray) -> tuple[int
     return _decode_evt21(words.astype(np.uint64) << 32 | 1, *state_and_columns)
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _decode_evt21(words, state, t, x, y, p):
     """Decode words of 64 bits by their upper 4 bits: 0 OFF, 1 ON, 32 pixels from x on, 8 the time's upper bits."""
     high, turns = state[0], state[1]
@@ -175,8 +173,7 @@ def _decode_evt21(words, state, t, x, y, p):
     return n, orphans
 
 
-@numba.njit(nogil=True, cache=True)
-@no_type_check
+@compiled
 def _decode_evt3(words, state, t, x, y, p):
     """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 masks of 12 and 8 pixels from it, 6, 8 time."""
     high, turns, low, row, base, polarity = state

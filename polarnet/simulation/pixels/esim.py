@@ -19,7 +19,7 @@ from polarnet.simulation.pixels.physics import PixelConfig
 EIGHT_BIT_VIDEO = False
 OPTIONS: tuple[str, ...] = ()
 NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
-NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test; `_levels` then counts exactly
+NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test
 
 
 @section
@@ -112,40 +112,21 @@ def _fire(pixels, steps, k, y, logarithm, pending, n):
     for x in range(w):
         i = y * w + x
         before, after, reference = pixels.logarithm[i], logarithm[x], pixels.reference[i]
-        on = after >= before
+        change, on = np.float64(after) - np.float64(before), after >= before
         sign = np.float32(1 if on else -1)
         threshold = np.float32(physics.threshold_on if on else physics.threshold_off)
-        if (after - reference) * sign < threshold * NEARLY:
+        if (after - reference) * sign < threshold * NEARLY or abs(change) <= NO_CHANGE:
             continue
-        crossed = _levels(before, after, reference, sign, threshold)
-        while n + crossed > pending.size:
-            pending = roomier(pending)
-        place, level = place_of(y, x), reference
-        for _ in range(crossed):
-            level += sign * threshold
-            event_us = start_us + dt * _crossing(before, after, level)
+        place, level = place_of(y, x), reference + sign * threshold
+        while level * sign > before * sign and level * sign <= after * sign:
+            pixels.reference[i] = level
+            event_us = start_us + dt * ((np.float64(level) - np.float64(before)) / change)
             if event_us - pixels.last_event_us[i] >= physics.refractory_us:
+                if n == pending.size:
+                    pending = roomier(pending)
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us
                 pending[n] = event_of(offset_us, place, on)
                 pixels.last_event_us[i] = event_us
                 n += 1
-        pixels.reference[i] = level
+            level += sign * threshold
     return pending, n
-
-
-@compiled
-def _levels(before, after, reference, sign, threshold):
-    """Number of threshold levels that a pixel crosses between two frames."""
-    crossed, level = 0, reference + sign * threshold
-    if abs(np.float64(after) - np.float64(before)) > NO_CHANGE:
-        while level * sign > before * sign and level * sign <= after * sign:
-            crossed, level = crossed + 1, level + sign * threshold
-    return crossed
-
-
-@compiled
-def _crossing(before, after, level):
-    """When a level is met, as a fraction of the time between two frames; 0 for a pixel at rest."""
-    if after == before:
-        return 0.0
-    return (np.float64(level) - np.float64(before)) / (np.float64(after) - np.float64(before))

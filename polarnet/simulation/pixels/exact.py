@@ -49,8 +49,6 @@ class Pixels(NamedTuple):
     dn: np.ndarray  # light of the last frame, DN
     response: np.ndarray  # response to that light
     lag: np.ndarray  # output of the photoreceptor minus response
-    buffer_lag: np.ndarray
-    """Output of the source follower minus that of the photoreceptor; empty without a source follower."""
     noise: np.ndarray  # of the photoreceptor, natural-log intensity; empty without it
     threshold_on: np.ndarray
     threshold_off: np.ndarray
@@ -83,7 +81,6 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
     change, dn, response, lag, leak = np.zeros((5, n), np.float32)
     return Pixels(
         change, dn, response, lag,
-        np.zeros(n if physics.source_follower_hz > 0 else 0, np.float32),
         np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32),
         threshold_on, threshold_off,
         np.float32(physics.leak_rate_hz * 1e-6) * leak_factor * threshold_on,
@@ -144,8 +141,6 @@ def advance(light, pixels, steps, columns):
                 _filter(dn, response, dn_before, response_before, pixels.lag[first:stop], rate, rise)
             else:
                 _difference(dn, response, dn_before, response_before, rise)
-            if physics.source_follower_hz > 0:
-                _buffer(rise, pixels.buffer_lag[first:stop], 2e-6 * math.pi * physics.source_follower_hz * dt_us)
             if physics.photoreceptor_noise > 0:
                 key = mixed(noise_key, steps.first_number + k)
                 wander(pixels.noise[first:stop], key, first, physics, dt_us * 1e-6, rise)
@@ -197,20 +192,6 @@ def _filter(dn, response, dn_before, response_before, lag, rate, rise):
         lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
         rise[j] = step + (lag_after - lag[j])
         lag[j], dn_before[j], response_before[j] = lag_after, dn[j], response[j]
-
-
-@borrowing
-def _buffer(rise, lag, a):
-    """The source follower: a first-order low-pass, where a = bandwidth * dt, of an input that rises linearly by `rise`.
-
-    The solution is that of `_filter` with one bandwidth for all pixels. `rise` becomes the rise of the output.
-    """
-    kept, mean_kept = np.float32(math.exp(-a)), np.float32(-math.expm1(-a) / a)
-    for j in range(rise.size):
-        lag_after = lag[j] * kept - rise[j] * mean_kept
-        lag_after = lag_after if abs(lag_after) > MIN_LAG else np.float32(0)
-        rise[j] += lag_after - lag[j]
-        lag[j] = lag_after
 
 
 @borrowing

@@ -53,11 +53,6 @@ class PixelConfig:
 
     It passes the low-pass of `cutoff_hz` at full brightness, as in v2e, so that ON and OFF events alternate.
     """
-    source_follower_hz: NonNegativeFloat
-    """Bandwidth of the source follower behind the photoreceptor, in any light; 0: infinite, as in v2e.
-
-    Photoreceptor and source follower are together a second-order low-pass (Lichtsteiner et al., JSSC 2008).
-    """
     leak_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """ON events per second of a pixel that sees no change."""
     leak_jitter: Annotated[float, Field(ge=0, le=1)]
@@ -94,7 +89,6 @@ class Physics(NamedTuple):
     threshold_correlation: float
     cutoff_hz: float
     photoreceptor_noise: float
-    source_follower_hz: float
     leak_rate_hz: float
     leak_jitter: float
     noise_rate_cov_decades: float

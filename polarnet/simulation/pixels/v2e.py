@@ -31,9 +31,7 @@ class Pixels(NamedTuple):
     """State of one channel, one array [h * w] per quantity; float32 unless stated."""
 
     memory: np.ndarray  # log intensity at the last event, less what leaked; float64 with a low-pass
-    filtered: np.ndarray
-    """Log intensity behind the low-passes of photoreceptor and source follower; float64 with a low-pass."""
-    photoreceptor: np.ndarray  # float64, log intensity between the two; empty without a source follower
+    filtered: np.ndarray  # log intensity behind the low-pass of the photoreceptor; float64 with a low-pass
     noise: np.ndarray  # of the photoreceptor, natural-log intensity; empty without it
     threshold_on: np.ndarray
     threshold_off: np.ndarray
@@ -76,13 +74,12 @@ class Slot(NamedTuple):
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
     """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
     n = height * width
-    real = np.float64 if physics.cutoff_hz > 0 or physics.source_follower_hz > 0 else np.float32
+    real = np.float64 if physics.cutoff_hz > 0 else np.float32
     threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
-    photoreceptor = np.zeros(n if physics.source_follower_hz > 0 else 0)
     since = np.full(n, -physics.refractory_s, np.float32)
     noise = np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32)
     memory, filtered = np.zeros((2, n), real)
-    return Pixels(memory, filtered, photoreceptor, noise, threshold_on, threshold_off, leak_factor, since)
+    return Pixels(memory, filtered, noise, threshold_on, threshold_off, leak_factor, since)
 
 
 @borrowing
@@ -100,8 +97,6 @@ def start(light, pixels, steps):
     dn, response = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
     _respond(light, steps, ZERO, ZERO, table_of_response(steps.physics), dn, response)
     pixels.filtered[:] = pixels.memory[:] = response
-    if pixels.photoreceptor.size:
-        pixels.photoreceptor[:] = response
     pixels.refractory_since[:] += np.float32(min(steps.times_us[0], 0.0) * 1e-6)
 
 
@@ -131,14 +126,7 @@ def advance(light, pixels, steps, columns):
             dn, response, noise = strip[0, : stop - first], strip[1, : stop - first], strip[2, : stop - first]
             filtered, memory, threshold_on = pixels.filtered[part], pixels.memory[part], pixels.threshold_on[part]
             _respond(light, steps, frame, y, table, dn, response)
-            if physics.source_follower_hz > 0:
-                photoreceptor = pixels.photoreceptor[part]
-                if physics.cutoff_hz > 0:
-                    _filter(response, dn, photoreceptor, 2 * math.pi * physics.cutoff_hz * dt)
-                else:
-                    photoreceptor[:] = response
-                _buffer(photoreceptor, filtered, min(1.0, 2 * math.pi * physics.source_follower_hz * dt))
-            elif physics.cutoff_hz > 0:
+            if physics.cutoff_hz > 0:
                 _filter(response, dn, filtered, 2 * math.pi * physics.cutoff_hz * dt)
             else:
                 filtered[:] = response
@@ -164,13 +152,6 @@ def _filter(response, dn, filtered, rate):
     for j in range(dn.size):
         share = min(1.0, (np.float64(dn[j]) + DARK_OFFSET) * per_dn)
         filtered[j] += share * (response[j] - filtered[j])
-
-
-@borrowing
-def _buffer(photoreceptor, filtered, share):
-    """The source follower: a first-order low-pass that closes `share` of the difference in a step."""
-    for j in range(filtered.size):
-        filtered[j] += share * (photoreceptor[j] - filtered[j])
 
 
 @borrowing

@@ -42,7 +42,7 @@ def claim(path, size):
     yield np.zeros(size, np.uint8)[:1]
 """
 FILE = Path("file.bin")
-LIBRARY = Library("Fragile", "numpy", "recordings", "the file is damaged")
+LIBRARY = Library("Fragile", "numpy", "the file is damaged")
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +77,7 @@ def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_op
         "from pathlib import Path\n"
         "import fragile_tasks\n"
         "from polarnet.recordings.formats.isolated import Library, ask_once\n"
-        "library = Library('Fragile', 'numpy', 'recordings', '')\n"
+        "library = Library('Fragile', 'numpy', '')\n"
         "print(ask_once(library, Path('file.bin'), fragile_tasks.answers, 1)[0])\n"
     )
     environment = os.environ | {"PYTHONPATH": str(project_root)}
