@@ -2,10 +2,9 @@ import re
 
 import pytest
 
-from polarnet.reports.charts import error_chart, event_budget_figure, reliability_chart, sweep_chart
+from polarnet.reports.charts import error_chart, reliability_chart, sweep_chart
 from polarnet.reports.figures import svg
 from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of
-from polarnet.reports.maps import png
 from polarnet.reports.tables import COLUMNS, score_table
 
 SCORES = {
@@ -102,15 +101,3 @@ def test_a_drawing_takes_its_colours_from_the_page_and_has_the_same_bytes_each_t
     assert "#00000" not in drawing
     assert "<text" in drawing
     assert all(name.startswith(("p", "m")) for name in re.findall(r' id="(\w+)"', drawing))  # clips and markers
-
-
-def test_the_event_budget_marks_the_papers_answer_and_has_the_same_bytes_each_time():
-    scores = {"psnr": 10.3, "corr": 0.3}
-    results = {
-        "since_start": {"cf": [{"events_per_pixel": x, **scores} for x in (0.2, 1.1, 4.0)]},
-        "window_length": {"cf": [{"window_us": x, **scores} for x in (5000, 33333)]},
-    }
-    figure = event_budget_figure(results)
-    assert any(line.get_linestyle() == "--" and line.get_xdata()[0] == 1.04 for line in figure.axes[0].lines)
-    assert lines(figure.axes[1]) == [[(5.0, 10.3), (33.333, 10.3)]]
-    assert png(figure) == png(event_budget_figure(results))
