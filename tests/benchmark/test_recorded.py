@@ -123,7 +123,7 @@ def test_a_folder_without_recordings_and_options_that_do_not_apply_are_refused(t
     with pytest.raises(ValueError, match=r"no recording with true polarization. e\.txt was skipped: expected a format"):
         make_recorded_set(tmp_path / "in", tmp_path / "work", MOSAIC, NOTHING)
     assert main(["benchmark", "--scenes", str(tmp_path), "--hot-pixels", "found"]) == 1
-    assert "apply to --recordings only" in capsys.readouterr().err
+    assert "--scenes: expected no --hot-pixels" in capsys.readouterr().err
     assert main(["benchmark", "--recordings", str(tmp_path), "--background", "20ev"]) == 1
     assert "--background: expected a time such as 10ms" in capsys.readouterr().err
 
