@@ -37,7 +37,7 @@ FORK = multiprocessing.get_context("fork")
 PLACE = "data/train/ours"
 """Where every command writes: `dvc repro train` writes nowhere else."""
 STORE = "data/events.zarr"
-SMALL = ["synthesize.duration_s=0.1", "synthesize.sensor_height=24", "synthesize.sensor_width=32", "runtime.threads=1"]
+SMALL = ["synthesize.duration_s=0.2", "synthesize.sensor_height=24", "synthesize.sensor_width=32", "runtime.threads=1"]
 TINY: dict[str, dict[str, Any]] = {
     "train": {"windows": 1, "crop": [24, 32]},
     "loss": {"lpips": 0},

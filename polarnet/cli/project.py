@@ -9,6 +9,7 @@ from ruamel.yaml import YAML
 
 from polarnet import __version__
 from polarnet.config.experiments import group_of, write_preset
+from polarnet.runtime.files import named_shortage
 from polarnet.terminal.installation import LPIPS, LPIPS_COMMAND, missing, shipped_settings, version_of
 
 COPIED = ("params.yaml", "conf/**/*.yaml", "stages/*.py", "data/**/README.md")
@@ -67,6 +68,23 @@ def new(options: argparse.Namespace) -> None:
     folder: Path = options.folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: expected a new or an empty folder, got one with files; name another")
+    try:
+        with named_shortage(folder):
+            _fill(folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    commands = [["cd", str(folder)], ["dvc", "repro"]]
+    if packages := missing("pipeline"):
+        commands.insert(0, ["pip", "install", *packages])
+    if version_of(LPIPS) is None:
+        commands.insert(0, shlex.split(LPIPS_COMMAND))
+    print(f"{folder / 'params.yaml'} has the values; these commands run the pipeline:")
+    print(*map(shlex.join, commands), sep="\n")
+
+
+def _fill(folder: Path) -> None:
+    """Write the files of a project."""
     source = shipped_settings()
     for path in (path for pattern in COPIED for path in sorted(source.glob(pattern))):
         target = folder / path.relative_to(source)
@@ -76,13 +94,6 @@ def new(options: argparse.Namespace) -> None:
     (folder / ".dvc").mkdir()
     for name, text in ((VERSION, f"polarnet {__version__}\n"), (".gitignore", IGNORED), (".dvc/config", DVC)):
         (folder / name).write_text(text, encoding="utf-8")
-    commands = [["cd", str(folder)], ["dvc", "repro"]]
-    if packages := missing("pipeline"):
-        commands.insert(0, ["pip", "install", *packages])
-    if version_of(LPIPS) is None:
-        commands.insert(0, shlex.split(LPIPS_COMMAND))
-    print(f"{folder / 'params.yaml'} has the values; these commands run the pipeline:")
-    print(*map(shlex.join, commands), sep="\n")
 
 
 def _write_pipeline(source: Path, target: Path) -> None:

@@ -80,6 +80,14 @@ class _Disk(io.FileIO):
             self.error = error
         return len(data)
 
+    def truncate(self, size: int | None = None) -> int:
+        """Cut or lengthen the file."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return self.tell()
+
     def check(self) -> None:
         """Raise the error of a write."""
         if self.error is not None:

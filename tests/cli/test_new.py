@@ -1,5 +1,6 @@
 """A project that `polarnet new` writes runs the pipeline with an installed polarnet."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -67,3 +68,13 @@ def test_a_folder_with_files_is_refused(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert main(["new", str(tmp_path)]) == 1
     assert "expected a new or an empty folder" in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_no_half_of_a_project(tmp_path, monkeypatch, capsys):
+    def full(source, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("polarnet.cli.project._write_pipeline", full)
+    assert main(["new", str(tmp_path / "lake")]) == 1
+    assert "lake: No space left on device; make room" in capsys.readouterr().err
+    assert not (tmp_path / "lake").exists()
