@@ -97,6 +97,6 @@ def test_the_refractory_period_is_where_intervals_pile_up():
 
 
 def test_recordings_of_two_sensors_are_refused(static, flickers):
-    other = recorded([200, 200], [0, 2e6], 8, 8)
+    other = recorded([200, 200], np.array([0.0, 2e6]), 8, 8)
     with pytest.raises(ValueError, match="one sensor"):
         fit_sensor(other, 200.0, flickers, SENSORS["default"])
