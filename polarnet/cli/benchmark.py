@@ -100,7 +100,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         benchmark = run_benchmark(test_set, context, settings, lpips, mapped)
         details = {
             "set": test_set.name,
-            "lpips": record_of(lpips and lpips.backbone),
+            "lpips": record_of(lpips.backbone if lpips else None),
             "train_mean": context.train_mean,
             "weights": weights_used(methods, context),
             "conditions": {"sentence": about, **used},
