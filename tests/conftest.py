@@ -25,7 +25,6 @@ SLOWEST_FIRST = (
     "captures/test_rig.py",
     "benchmark/test_recorded.py",
     "cli/test_fit_sensor.py",
-    "config/test_sweep.py",
 )
 """Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
 LARGE_PACKAGES = (
