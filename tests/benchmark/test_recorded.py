@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 import torch
-from event_fixtures import make_events, make_random_events
 
 from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main
@@ -22,13 +21,10 @@ from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
 from polarnet.runtime.machine import generator_for
 from polarnet.simulation.sets import make_folder_set
-from polarnet.storage.events import EventStore
-from polarnet.storage.frames import FrameStore
+from polarnet.storage import EventStore, FrameStore
 from studies.recording_files import WHITE, mosaicked, write_e2p
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
-
-__all__ = ["make_events", "make_random_events"]
 
 pytest.importorskip("h5py")
 
@@ -39,12 +35,6 @@ TINY = [
     "benchmark.panel_scenes=1", "benchmark.lpips=false", "runtime.threads=1",
     "baselines.e2v.crop=null", "baselines.e2p.crop=null",
 ]  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def usual_kernels():
-    yield
-    torch.use_deterministic_algorithms(False)
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +103,7 @@ def test_events_and_frames_on_one_clock_agree_and_a_shift_is_found(recording):
     assert "ms late against the events" in note
 
 
-def test_events_that_have_nothing_to_do_with_the_frames_are_reported_and_frames_far_from_them_refused(
-    recording, make_random_events, tmp_path
-):
+def test_unrelated_events_are_reported_and_frames_far_from_them_refused(recording, make_random_events, tmp_path):
     truth = read_truth(recording, MOSAIC)
     noise = make_random_events(0, 20_000, int(truth.t_us[-1]), 80, 112)
     (note,) = clock_notes(truth.t_us, frame_lag(noise, truth))
@@ -127,13 +115,17 @@ def test_events_that_have_nothing_to_do_with_the_frames_are_reported_and_frames_
         read_recorded(path, "far", MOSAIC, NOTHING)
 
 
-def test_a_folder_without_recordings_says_what_was_expected(tmp_path, make_events):
+def test_a_folder_without_recordings_and_options_that_do_not_apply_are_refused(tmp_path, make_events, capsys):
     with pytest.raises(ValueError, match="expected a folder of recordings, got none"):
         make_recorded_set(tmp_path / "none", tmp_path / "work", MOSAIC, NOTHING)
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "e.txt").write_text("4 4\n1 2 3 1\n")
     with pytest.raises(ValueError, match=r"no recording with true polarization. e\.txt was skipped: expected a format"):
         make_recorded_set(tmp_path / "in", tmp_path / "work", MOSAIC, NOTHING)
+    assert main(["benchmark", "--scenes", str(tmp_path), "--hot-pixels", "found"]) == 1
+    assert "--scenes: expected no --hot-pixels" in capsys.readouterr().err
+    assert main(["benchmark", "--recordings", str(tmp_path), "--background", "20ev"]) == 1
+    assert "--background: expected a time such as 10ms" in capsys.readouterr().err
 
 
 def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tmp_path):
@@ -150,10 +142,3 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     (note,) = clean.notes
     assert "of 1 hot pixels" in note
     assert mosaicked(truth.intensity.numpy()).shape == truth.light.shape
-
-
-def test_options_of_recordings_do_not_apply_elsewhere(tmp_path, capsys):
-    assert main(["benchmark", "--scenes", str(tmp_path), "--hot-pixels", "found"]) == 1
-    assert "--scenes: expected no --hot-pixels" in capsys.readouterr().err
-    assert main(["benchmark", "--recordings", str(tmp_path), "--background", "20ev"]) == 1
-    assert "--background: expected a time such as 10ms" in capsys.readouterr().err
