@@ -289,7 +289,7 @@ def kills(cases: int) -> dict[str, dict[str, int]]:
 
 NAMES = ["../outside", "../../../outside", "{root}/outside", "b/../../outside", "..", ".", "", "b\\..\\outside"]
 NAMES += ["b\x00", "b\n", "b\u202e", "b\u2028"]
-COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"]}
+COMMANDS = {"convert": ["out"], "inspect": [], "recover": ["--out", "out", "--method", "cf"], "video": []}
 """Commands that read a store whole, and what follows its name."""
 
 

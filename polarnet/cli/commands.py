@@ -155,6 +155,22 @@ def _stores(command: AddCommand) -> None:
     verify.add_argument(
         "store", type=input_name, help="store or its URL, checkpoint (.safetensors), running.pt, folder"
     )
+    video = command(
+        "video",
+        "stores.video",
+        "draw a stored sequence and its truth as a video that browsers play",
+        "video outputs/simulate/lake/events.zarr",
+        "video data/events.zarr lake-0 --out lake.mp4",
+        description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
+        "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
+        "predictions.",
+    )
+    video.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
+    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
+    video.add_argument(
+        "--truth", type=input_name, metavar="FRAMES", help="true frames (default: those beside the store)"
+    )
+    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
     replay = command(
         "replay",
         "stores.replay",

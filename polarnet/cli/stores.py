@@ -1,4 +1,4 @@
-"""Commands that look at stores and recordings: inspect, view, replay, verify."""
+"""Commands that look at stores and recordings: inspect, view, video, replay, verify."""
 
 import argparse
 import functools
@@ -16,14 +16,16 @@ from polarnet.recordings.live import replay as replay_events
 from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
+from polarnet.reports.preview import write_true_video
 from polarnet.reports.recordings import recording_picture
 from polarnet.reports.viewing import films_of
 from polarnet.runtime.files import ORIGIN, SUMS, changed_files
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, SplitStore
 from polarnet.storage.groups import is_url, open_group
-from polarnet.storage.parts import Store
+from polarnet.storage.parts import Store, unknown_sequence
 from polarnet.storage.scenes import SceneStore
+from polarnet.storage.true_frames import open_truth, truth_beside
 from polarnet.training.engine.recorder import read_running
 
 STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
@@ -71,6 +73,24 @@ def _written_page(options: argparse.Namespace) -> Path:
     page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
     page.parent.mkdir(parents=True, exist_ok=True)
     return write_player(page, f"{options.path}", films, {"command": options.command_line})
+
+
+def video(options: argparse.Namespace) -> None:
+    """Draw a stored sequence and its truth."""
+    store = EventStore.open(options.store)
+    name = store.sequences[0] if options.sequence is None and len(store.sequences) == 1 else options.sequence
+    if name not in store.sequences:
+        raise ValueError(f"{options.store}: {unknown_sequence(name, store.sequences)}")
+    truth = options.truth or truth_beside(options.store)
+    if truth is None:
+        raise ValueError(
+            f"{options.store}: expected frames.zarr or truth.zarr beside it, there is none; name the true frames with "
+            f"--truth, or draw predictions with `polarnet recover {options.store}`"
+        )
+    out = options.out or Path("outputs", "video", f"{name}.mp4")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_true_video(out, store.read(name), open_truth(truth, name))
+    print(f"video {out}")
 
 
 def replay(options: argparse.Namespace) -> None:

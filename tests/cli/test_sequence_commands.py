@@ -1,4 +1,4 @@
-"""Commands on stored sequences: inspect, convert of some, and recovery with truth."""
+"""Commands on stored sequences: inspect, video, convert of some, and recovery with truth."""
 
 import av
 import numpy as np
@@ -15,6 +15,20 @@ def test_inspect_names_sequences_and_video_shows_each_true_frame_after_the_first
     assert all("0.200 s" in line and line.endswith(" events") for line in lines)
     assert main(["inspect", str(simulated.frames)]) == 0
     assert [line.split()[1] for line in capsys.readouterr().out.splitlines()] == ["train", "train", "train", "val"]
+
+
+def test_video_shows_a_picture_for_each_true_frame_after_the_first(simulated, tmp_path, capsys):
+    assert main(["video", str(simulated.events), "b-0", "--out", str(tmp_path / "b.mp4")]) == 0
+    with av.open(str(tmp_path / "b.mp4")) as file:
+        assert len([*file.decode(video=0)]) == len(zarr_times(simulated)) - 1
+    assert main(["video", str(simulated.events), "e-0"]) == 1
+    assert "expected a sequence of a-0, b-0, c-0, d-0; got 'e-0'" in capsys.readouterr().err
+
+
+def zarr_times(simulated):
+    from polarnet.storage.frames import FrameStore
+
+    return FrameStore.open(simulated.frames).t_us("b-0")
 
 
 def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path):
