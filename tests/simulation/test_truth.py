@@ -70,7 +70,6 @@ def test_the_stored_truth_of_each_picture_is_that_of_its_scene_and_follows_equat
     assert [len(frames.of_split(split)) for split in ("train", "val", "test")] == [6, 2, 2]
     for split in ("train", "val", "test"):
         assert frames.of_split(split) == scenes.of_split(split)
-    scenes, frames = stores
     t_us = frame_times_us(CONFIG)
     for sequence in scenes.sequences[:3]:
         record = scenes.read(sequence)
@@ -83,7 +82,6 @@ def test_the_stored_truth_of_each_picture_is_that_of_its_scene_and_follows_equat
         torch.testing.assert_close(stored.dolp, degree, atol=1 / 65535, rtol=0)
         turn = (stored.aolp - angle + torch.pi / 2) % torch.pi - torch.pi / 2
         assert turn.abs().max() <= torch.pi / 65536
-    _, frames = stores
     truth = frames.frames(frames.sequences[0])
     stokes = stokes_from_intensities(truth.intensity)
     bright = stokes[:, 0] > 0.2
