@@ -164,12 +164,17 @@ def stokes_unet(project_root):
     return StokesUNet(load(project_root).networks.polarnet)
 
 
-def test_a_network_that_is_told_the_thresholds_does_not_estimate_them(sequence, stokes_unet):
+def test_a_network_that_is_told_thresholds_or_blocks_of_pixels_uses_them(sequence, stokes_unet, project_root):
     given = recovered(dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.4)), sequence.windows[:1])
     assert stokes_unet.scale.given == pytest.approx(0.2 / stokes_unet.step)
     inputs = encode_windows(sequence.events, sequence.t_us[:2], weighted_counts((0.5, 2.0)))[:, None]
     with torch.no_grad():
         torch.testing.assert_close(given.dolp, stokes_unet.unroll(inputs)[0].dolp[:, 0].clamp(0, 1))
+    coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
+    coarse.load_state_dict(stokes_unet.state_dict())
+    stokes_unet.scale.given = None
+    told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows)
+    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows).dolp)
 
 
 @pytest.mark.parametrize(("network", "option", "words"), [

@@ -66,7 +66,6 @@ def test_frames_come_back_to_half_a_step_with_their_splits_and_pictures(finished
         assert torch.equal(store.quantity("dolp", name), frames.dolp)
         some = store.frames(name, 5, 9)
         assert all(torch.equal(part, whole[5:9]) for part, whole in zip(some[:4], frames[:4], strict=True))
-    store = FrameStore.open(finished)
     assert store.splits == {"a": "train", "b": "test"}
     assert [store.of_split(split) for split in ("train", "val", "test")] == [["a"], [], ["b"]]
     with pytest.raises(ValueError, match="train, val, test, got 'validation'"):

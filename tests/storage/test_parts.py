@@ -213,7 +213,6 @@ def test_whichever_rename_a_writer_dies_before_the_rerun_ends_with_the_same_byte
 
     for name in moves:
         monkeypatch.setattr(os, name, functools.partial(move_or_die, name))
-    gc.collect()
     gc.freeze()  # so that each of many collections looks at the objects of this test alone
     write_two_parts()
     expected = files_of(path)
