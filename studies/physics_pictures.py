@@ -20,7 +20,7 @@ from polarnet.reports.maps import dolp_image
 from polarnet.simulation.pixels.light import respond
 from polarnet.simulation.pixels.physics import physics_of
 from polarnet.stokes import dolp, intensities_from_stokes, stokes_from_intensities
-from studies.simulation_pictures import ON, QUIET, drawn, few_colours, photograph, write_pictures
+from studies.simulation_pictures import LINE, ON, QUIET, drawn, events_under, few_colours, photograph, write_pictures
 from studies.study import ROOT
 
 COLOURS = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
@@ -34,6 +34,7 @@ EVENT_STYLES: tuple[dict[str, Any], ...] = (
     {"color": COLOURS[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
     {"color": LIGHT.quiet, "linestyle": "-."},
 )  # fmt: skip
+V2E_NOISE = (0.0551, 0.211)  # deviation, and events of each sign per second in two runs (tests of the emulator's noise)
 
 
 @drawn(7.2, 2.0)
@@ -79,9 +80,42 @@ def light_figure(figure: Figure) -> None:
     events.set_title("a swing by e² once a second", loc="left", fontsize=9)
 
 
+@drawn(9.0, 2.7)
+def options_figure(figure: Figure) -> None:
+    """Draw the events of the photoreceptor's noise against its deviation, and of a ramp by both refractory periods."""
+    noise, ramp = figure.subplots(1, 2)
+    deviations, seconds, pixels = np.linspace(0.045, 0.08, 8), 10, 1_000
+    t_us = np.arange(seconds * 1000 + 1) * 1000.0
+    quiet = replace(QUIET, cutoff_hz=30.0)
+    for model, colour, style in (("exact", COLOURS[1], "-"), ("v2e", COLOURS[3], "o")):
+        noisy = [replace(quiet, model=model, photoreceptor_noise=deviation) for deviation in deviations]
+        counts = [len(events_under(np.full(len(t_us), 60.0), t_us, config, pixels)) for config in noisy]
+        rates = np.array(counts) / (2 * pixels * seconds)
+        noise.semilogy(deviations, rates, style, color=colour, markersize=4, label=model)
+    noise.plot(*V2E_NOISE, "x", color=ON, markersize=8, label="v2e's own program")
+    noise.set(xlabel="deviation of the noise, ln units", ylabel="events of each sign per second")
+    noise.legend(fontsize=8, frameon=False, loc="lower right")
+    noise.set_title("photoreceptor noise, 30 Hz, thresholds 0.2", loc="left", fontsize=9)
+    t_us = np.arange(0, 6_001, 50.0)
+    light = 60 * np.exp(t_us.clip(500, 1_500) / 1000 - 0.5)
+    keep = replace(QUIET, refractory_period_us=500.0)
+    reset, v2e = replace(keep, refractory="reset"), replace(keep, model="v2e")
+    for label, config, colour in (
+        ("exact, keep", keep, COLOURS[1]), ("exact, reset", reset, ON), ("v2e", v2e, COLOURS[3])
+    ):  # fmt: skip
+        t_ms = events_under(light, t_us, config).t.numpy() / 1000
+        ramp.step(np.r_[0, t_ms, 6], np.r_[0, np.arange(1, len(t_ms) + 1), len(t_ms)], where="post", color=colour,
+                  linewidth=1.4, label=label)  # fmt: skip
+    ramp.plot(t_us / 1000, np.log(light / 60) / 0.2, label="log light / 0.2", **LINE)
+    ramp.set(xlabel="ms", ylabel="events", xlim=(0, 4), ylim=(0, 5.4))
+    ramp.legend(fontsize=8, frameon=False, loc="lower right")
+    ramp.set_title("refractory period of 0.5 ms", loc="left", fontsize=9)
+
+
 FIGURES = {
     "theory_gains": gains_figure,
     "physics_light": light_figure,
+    "physics_options": options_figure,
 }
 
 

@@ -75,13 +75,18 @@ def _edge(t_ms: Float64[np.ndarray, " n"], at_ms: float) -> Float64[np.ndarray, 
     return ((t_ms - at_ms) / 6).clip(0, 1)
 
 
+def events_under(light_dn: Float64[np.ndarray, " n"], t_us: Float64[np.ndarray, " n"], config: EmulatorConfig,
+                 pixels: int = 1, key: int = 5) -> Events:  # fmt: skip
+    """Events of neighbouring pixels under one light."""
+    frames = torch.from_numpy(light_dn.astype(np.float32))[:, None, None, None].expand(-1, 1, 1, pixels)
+    (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=key)
+    return events
+
+
 def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int = 1) -> Events:
     """Events of neighbouring pixels under the light of `light_of_one_pixel`."""
     t_us = np.rint(np.arange(1 + DURATION_MS * 1e-3 * rate_hz) * 1e6 / rate_hz)
-    light_dn = light_of_one_pixel(t_us / 1000).astype(np.float32)
-    frames = torch.from_numpy(light_dn)[:, None, None, None].expand(-1, 1, 1, pixels)
-    (events,), _ = emulate(frames.contiguous(), torch.from_numpy(t_us), config, key=3)
-    return events
+    return events_under(light_of_one_pixel(t_us / 1000), t_us, config, pixels, key=3)
 
 
 @drawn(9.0, 5.2)
