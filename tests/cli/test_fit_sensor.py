@@ -51,6 +51,7 @@ def test_the_yaml_written_loads_as_a_sensor(folder, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert "leak_rate_hz" in printed
     assert "not estimated" in printed
+    assert "flicker: flicker.txt: Twin to recording: event rate" in printed
     written = (folder / "conf" / "sensor" / "mine.yaml").read_text()
     assert "contrast_threshold_on: 0.173" in written  # ln 4 / 8
     assert "contrast_threshold_off: 0.173" in written
@@ -64,7 +65,7 @@ def test_the_yaml_written_loads_as_a_sensor(folder, capsys, monkeypatch):
 
 def test_a_log_shows_the_progress_of_each_part_of_the_work(folder, progress_log):
     assert main([*FIT, "--name", "mine", *FLICKER]) == 0
-    assert {line.split(":")[0] for line in progress_log() if "100%" in line} == {"read", "sort", "fit"}
+    assert {line.split(":")[0] for line in progress_log() if "100%" in line} == {"read", "sort", "fit", "twin"}
 
 
 @pytest.mark.parametrize(
