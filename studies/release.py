@@ -2,8 +2,9 @@
 
 Runs every study whose section of docs/results names another commit than HEAD, one after the other, so that a run that
 was stopped goes on where it was. FOLDER of --shared holds the photographs (data/rgb, data/rgb_more), the measured
-scenes (data/polarization, data/polarization_more) and the recordings (cases/recordings) that the figures are about.
-The two runs of hours, `paper_small` and `photographs`, are made by hand (`studies.measure --run`).
+scenes (data/polarization, data/polarization_more), the recordings (cases/recordings) that the figures are about, and
+the published FireNet (weights/firenet_1000.pth.tar). The two runs of hours, `paper_small` and `photographs`, are made
+by hand (`studies.measure --run`).
 
 Then docs/results/release.json gets the commit, the number of sections and of those from another commit, the lines of
 README and docs, and what README's installation downloads.
@@ -11,6 +12,7 @@ README and docs, and what README's installation downloads.
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,7 +22,11 @@ from typing import Any
 from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
 
 SETS = "--photographs {shared}/data/rgb --measured {shared}/data/polarization {shared}/data/polarization_more"
-LARGE = SETS + " --photographs-large {shared}/data/rgb_more --work {work}/robustness --limit 24 --sensor-limit 12"
+FIRENET = "data/external/firenet_1000.pth.tar"
+LARGE = (
+    f"{SETS} --photographs-large {{shared}}/data/rgb_more --work {{work}}/robustness --limit 24 --sensor-limit 12 "
+    f"--set +rows.firenet_published={{{{needs:{FIRENET},settings:methods}}}}"
+)
 STUDIES = {
     ("robustness", "test"): "studies.robustness " + LARGE,
     ("robustness", "whole_file_test"): "studies.robustness --whole-file --conditions photographs photographs_large "
@@ -84,6 +90,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", metavar="NAME", help="files of docs/results (default: all)")
     arguments = arguments_of(parser)
     record = machine_record()
+    (ROOT / FIRENET).parent.mkdir(parents=True, exist_ok=True)
+    if (published := arguments.shared / "weights" / Path(FIRENET).name).exists():
+        shutil.copy(published, ROOT / FIRENET)
     missing = set(of_other_commits(record["commit"]))
     environment = os.environ | {"POLARNET_SHARED": str(arguments.shared)}
     for (name, section), words in STUDIES.items():
