@@ -174,6 +174,10 @@ def test_a_changed_file_runs_what_it_can_change(project, file, stages):
     assert repro() == stages
 
 
+OF_ALL_METHODS = {"benchmark@cf+gain", "benchmark@highpass+gain", "benchmark@registered"}
+"""Rows that read two sections of `methods`, and so all of them."""
+
+
 def put(section: str, **values: Any) -> Callable[[Any], None]:
     """An edit of some keys of a section."""
     return lambda params: functools.reduce(operator.getitem, section.split("."), params).update(values)
@@ -183,10 +187,9 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
     ("change", "stages"),
     [
         (put("networks.paper", swin_depth=3), set()),
-        (put("methods.sharpening", unsharp_amount=0.5), {"benchmark@cf+gain", "benchmark@highpass+gain", "report"}),
+        (put("methods.sharpening", unsharp_amount=0.5), OF_ALL_METHODS | {"report"}),
         thorough(put("baselines.e2v", epochs=2), {"train_baseline@e2v", "report"}),
-        thorough(put("methods.cf", cutoff_hz=1.0), {"benchmark@cf", "benchmark@cf+gain", "benchmark@highpass+gain",
-                                                    "report"}),
+        thorough(put("methods.cf", cutoff_hz=1.0), OF_ALL_METHODS | {"benchmark@cf", "report"}),
         thorough(put("loss", mse=12.0), {"train", "report"}),
         thorough(put("benchmark", bootstrap_samples=100), {"report"}),
         thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"}),

@@ -69,7 +69,7 @@ def test_inspect_writes_the_list_of_hot_pixels_that_recover_reads(folder, capsys
     rows = [(10 * k, k // 2 % 18, k // 36 % 12, 1) if k % 2 else (10 * k, 3, 4, 1) for k in range(4000)]
     (folder / "e.txt").write_text("18 12\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in rows))
     assert main(["inspect", "e.txt", "--out", "out"]) == 0
-    assert "list        out/e.txt.hot.txt, for --hot-pixels" in capsys.readouterr().out
+    assert "hot pixels  out/e.txt.hot.txt, for --hot-pixels" in capsys.readouterr().out
     assert read_hot_pixels(folder / "out" / "e.txt.hot.txt", 12, 18).sum() == 1
     recovered = ("--method", "highpass", "--window", "10ms", "--write", "zarr", "--out", "recovered")
     assert main(["recover", "e.txt", *recovered, "--hot-pixels", "out/e.txt.hot.txt"]) == 0

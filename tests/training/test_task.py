@@ -34,7 +34,7 @@ def split_of(simulated, task: Task) -> Split:
 def test_a_training_starts_from_the_weights_of_a_checkpoint_of_the_same_size_and_names_them(tmp_path):
     for name, network in (("other", NETWORK), ("wider", dataclasses.replace(NETWORK, channels=[8, 8, 8]))):
         weights = dolp_task("paper", network, TRAIN, LOSS, None, seed=SEED + 1).network.state_dict()
-        save_checkpoint(tmp_path / f"{name}.safetensors", weights, {"network": "paper"})
+        save_checkpoint(tmp_path / f"{name}.safetensors", weights, {"network": "paper", "config": {}})
     start, wider = (str(tmp_path / f"{name}.safetensors") for name in ("other", "wider"))
     task = dolp_task("paper", NETWORK, dataclasses.replace(TRAIN, start=start), LOSS, None, SEED)
     tensors, known = load_checkpoint(start)
@@ -47,7 +47,7 @@ def test_a_training_starts_from_the_weights_of_a_checkpoint_of_the_same_size_and
 
 def test_a_checkpoint_tells_what_decided_its_weights_without_a_path_of_this_machine(simulated, tmp_path):
     start = str(tmp_path / "start.safetensors")
-    save_checkpoint(Path(start), dolp().network.state_dict(), {"network": "paper"})
+    save_checkpoint(Path(start), dolp().network.state_dict(), {"network": "paper", "config": {}})
     config, loss = dataclasses.replace(TRAIN, start=start), dataclasses.replace(LOSS, half_weight=0.05)
     task = dolp_task("paper", NETWORK, config, loss, None, SEED)
     described = describe(task, split_of(simulated, task), config, "alex", SEED, torch.device("cpu"))
@@ -106,5 +106,5 @@ def test_a_record_names_its_lpips_settings_and_without_lpips_in_the_loss_no_weig
         assert set(baseline.lpips) <= set(baseline.config.__dataclass_fields__)
     loads_nothing = dataclasses.replace(BASELINES["e2v"], lpips=(), task=lambda settings, lpips, seed: lpips)
     monkeypatch.setattr("polarnet.training.e2v.BASELINE", loads_nothing)
-    _, lpips = train._task(load(ROOT, ["baseline=e2v", "paths.weights=nowhere"]))
+    _, lpips = train._task(load(ROOT, ["baseline=e2v"]))
     assert lpips is None
