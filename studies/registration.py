@@ -37,7 +37,6 @@ from studies.study import arguments_of, command_line, machine_record, write_sect
 THRESHOLD = 0.2  # change of natural-log intensity per event
 LINE = 4  # pixels, width of a line along the motion
 MAX_S = 0.98
-FLOOR = 1e-3
 
 
 def redundant_offset(panorama: Panorama) -> Float64[np.ndarray, " 2"]:
