@@ -5,10 +5,11 @@
   docs/results/robustness.json, section speed.
 - network with --before CHECKOUT: the same of an older checkout of this repository, in turns with this one, and the
   ratios of the medians. --write: docs/results/speed.json, section turns, and speedup_HEIGHTxWIDTH of files and cameras.
-- simulation: a sensor of 120 x 180 pixels drifts over the coffee photograph at 110 px/s for a second: 300 steps, four
-  channels. Times run from rendering to columns in memory and are medians of wall-clock time with compiled kernels.
-  Every model and number of threads runs in its own process; the processes take turns, so that other load affects all
-  of them alike. --write: docs/results/emulation.json.
+- simulation: events of one drifting sensor (`studies.simulation_run`). Times are medians of wall-clock time. Every
+  model and number of threads runs in its own process; the processes take turns, so that other load affects all of them
+  alike. --write: docs/results/emulation.json.
+- simulation with --before CHECKOUT: processor time of v2e and exact on one thread, of both checkouts in turns.
+  --write: docs/results/speed.json, section simulation_turns.
 - live: `polarnet recover` of a million random events a second on 260 x 346 pixels, with every output and with numbers
   alone. From a store: how many times as fast as real time. `--live`, `--seconds` (60) of lines through a pipe: latency,
   joined windows, and memory in the second and the last third of the time. --write: docs/results/speed.json.
@@ -24,13 +25,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from skimage import data
 
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, concatenate
@@ -40,14 +39,9 @@ from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
-from polarnet.runtime.machine import configure, precision_on, tune, usable_cores
-from polarnet.simulation.camera import Camera
-from polarnet.simulation.motion import HARMONICS, Sine
-from polarnet.simulation.moving_sensor import emulate_motion
-from polarnet.simulation.presets import SENSORS
-from polarnet.simulation.scene import scene_from_rgb
+from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
-from studies.simulated_rig import Drift
+from studies import simulation_run
 from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
 
 SIZES = ((120, 180), (260, 346), (480, 640))
@@ -57,11 +51,10 @@ CPU = torch.device("cpu")
 SHIFT = 2  # pixels per window of the points, whose motion the network finds
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 WINDOW_US = round(1e6 / 30)
-HEIGHT, WIDTH, DURATION_US, SPEED_PX_S = 120, 180, 1_000_000, 110.0
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
 LIVE_SIZE, EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = (260, 346), 1_000_000, 100, 10, 10
-ROUNDS, REPEATS = 3, 9  # processes of each model and number of threads, runs of each process
+ROUNDS, PAIRS = 3, 12  # processes of each model and number of threads; of each checkout
 
 
 def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
@@ -116,40 +109,52 @@ def measure_network(threads: int) -> dict[str, Any]:
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
 
 
+def in_turns(before: Path, rounds: int, *script: object) -> dict[Path, list[dict[str, Any]]]:
+    """What a script of this checkout prints as JSON with the packages of `before` and with those of this one, in turns.
+
+    Each checkout goes first in every other round.
+    """
+    turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
+    for number in range(rounds):
+        for root in list(turns)[:: (-1) ** number]:
+            environment = {**os.environ, "PYTHONPATH": str(root)}
+            command = [sys.executable, *map(str, script)]
+            done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+            turns[root].append(json.loads(done.stdout.splitlines()[-1]))
+    return turns
+
+
 def measure_turns(before: Path, threads: int) -> dict[str, Any]:
     """Medians of windows a second of the checkout `before` and of this one, which take turns, and their ratios."""
-    turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
-    for _ in range(ROUNDS):
-        for root, measured in turns.items():
-            command = [sys.executable, __file__, "--sizes", str(threads)]
-            environment = {**os.environ, "PYTHONPATH": str(root)}
-            done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-            measured.append(json.loads(done.stdout.splitlines()[-1])["sizes"])
+    turns = in_turns(before, ROUNDS, __file__, "--sizes", threads)
 
     def medians(root: Path, size: str) -> dict[str, float]:
-        return {kind: float(np.median([one[size]["pixels"][kind] for one in turns[root]])) for kind in KINDS}
+        return {kind: float(np.median([one["sizes"][size]["pixels"][kind] for one in turns[root]])) for kind in KINDS}
 
     sizes = {}
-    for size in turns[ROOT][0]:
+    for size in turns[ROOT][0]["sizes"]:
         old, new = medians(before, size), medians(ROOT, size)
         sizes[size] = {"before": old, "now": new, "speedup": {kind: round(new[kind] / old[kind], 2) for kind in KINDS}}
     return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": sizes}
 
 
-def measure_model(model: str, threads: int) -> dict[str, Any]:
-    """Seconds of each run, events and peak memory of one model in this process, which is set up as stages are."""
-    torch.set_num_threads(threads)
-    tune()
-    scene = scene_from_rgb(torch.from_numpy(data.coffee()).permute(2, 0, 1).float() / 255)
-    x, y, still = (scene.width - 1) / 2, (scene.height - 1) / 2, Sine(0.0, 0.0, 0.0)
-    path = Drift(x, y, (still,) * HARMONICS, (still,) * HARMONICS, still, still, SPEED_PX_S)
-    camera, seconds = Camera(replace(SENSORS["default"], model=model), key=1), []
-    for _ in range(REPEATS + 1):  # the first compiles
-        start = time.perf_counter()
-        events = emulate_motion(camera, scene, path, DURATION_US, (HEIGHT, WIDTH), threads)
-        seconds.append(time.perf_counter() - start)
-    peak_mib = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-    return {"seconds": seconds[1:], "events": sum(map(len, events)), "peak_mib": peak_mib}
+def measure_simulation_turns(before: Path) -> dict[str, Any]:
+    """Processor time of a run by model on one thread, of the checkout `before` and of this one, and their ratios.
+
+    A ratio is the median of those of the processes that ran one after the other.
+    """
+    figures: dict[str, Any] = {"commit_before": git(before, "rev-parse", "HEAD"), "pairs": PAIRS}
+    for model in MODELS[:2]:
+        turns = in_turns(before, PAIRS, simulation_run.__file__, model, 1)
+        old, new = (np.array([np.median(one["cpu_seconds"]) for one in turns[root]]) for root in (before, ROOT))
+        events = {str(one["events"]) for root in turns for one in turns[root]}
+        figures[model] = {
+            "cpu_seconds_before": round(float(np.median(old)), 4),
+            "cpu_seconds": round(float(np.median(new)), 4),
+            "time_over_before": round(float(np.median(new / old)), 3),
+            "events": "equal in number" if len(events) == 1 else "of other numbers",
+        }
+    return figures
 
 
 def measure_models() -> dict[str, dict[str, Any]]:
@@ -157,7 +162,7 @@ def measure_models() -> dict[str, dict[str, Any]]:
     runs: dict[tuple[str, int], list[dict[str, Any]]] = {(model, t): [] for model in MODELS for t in THREADS}
     for _ in range(ROUNDS):
         for model, threads in runs:
-            runs[model, threads].append(in_own_process("studies.speed", "--one", model, threads))
+            runs[model, threads].append(in_own_process("studies.simulation_run", model, threads))
     seconds = {key: float(np.median([s for one in of_key for s in one["seconds"]])) for key, of_key in runs.items()}
     return {
         model: {
@@ -240,11 +245,16 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=60, help="of live input")
     parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
     parser.add_argument("--before", type=Path, help="older checkout, measured in turns with this one")
-    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--sizes", help=argparse.SUPPRESS)
     arguments = arguments_of(parser)
     if arguments.sizes:
         print(json.dumps(measure_network(int(arguments.sizes))))
+        return
+    if arguments.before and arguments.only == "simulation":
+        record, turns = machine_record(), measure_simulation_turns(arguments.before)
+        print(json.dumps(turns, indent=1))
+        if arguments.write:
+            write_section("speed", "simulation_turns", turns, record)
         return
     if arguments.before:
         record, turns = machine_record(), measure_turns(arguments.before, arguments.threads)
@@ -252,10 +262,6 @@ def main() -> None:
         if arguments.write:
             headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in turns["sizes"].items()}
             write_section("speed", "turns", turns, record, headlines)
-        return
-    if arguments.one:
-        model, threads = arguments.one
-        print(json.dumps(measure_model(model, int(threads))))
         return
     studies: dict[str, tuple[str, str, Callable[[], dict[str, Any]]]] = {
         "network": ("robustness", "speed", lambda: measure_network(arguments.threads)),
