@@ -24,7 +24,7 @@ from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
 from polarnet.simulation.presets import POLARIZERS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from studies.simulation_pictures import QUIET
-from studies.study import ROOT, arguments_of, command_line, machine_record, passed, write_section
+from studies.study import ROOT, arguments_of, command_line, machine_record, outcomes, write_section
 
 SIZE = (12, 16)  # rows and columns of the calibrated sensor
 STEP = 0.01  # contrast thresholds of its pixels, natural-log intensity
@@ -108,9 +108,9 @@ def analyzer_errors(sensor: EmulatorConfig, seed: int = 1) -> Float64[Tensor, "4
 def main() -> None:
     """Measure, print, and with --write keep the figures."""
     write = arguments_of(command_line(__doc__, "docs/results/camera.json")).write
-    record, cases = machine_record(), passed(*(f"tests/{test}" for test in DEFECTS))
+    record, cases = machine_record(), outcomes(*(f"tests/{test}" for test in DEFECTS))
     mended = {
-        test: min(right for case, right in cases.items() if case.partition("[")[0] == test.partition("::")[2])
+        test: min(one["passed"] for case, one in cases.items() if case.partition("[")[0] == test.partition("::")[2])
         for test in DEFECTS
     }
     exact, noisy = (analyzer_errors(sensor) for sensor in (FINE, SENSORS["default"]))

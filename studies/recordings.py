@@ -6,16 +6,19 @@ Sections of docs/results/recordings.json, each measured in processes of their ow
   a 1280 x 720 sensor where the format has no other (10 k events a packet or message). The CPU time is that of the
   process and its children, the shortest of three runs, with the file in the disk cache. Writers: the same from memory.
 - `bytes`: memory of `read_recording` for each event more, between 8 and 32 M events.
-- `memory`: peak of `inspect`, `convert` and `recover --method highpass` on 2, 8 and 32 M events of a 346 x 260 sensor.
-- `cases`: tests of the reference cases, with POLARNET_SHARED.
+- `memory`: peak of `inspect`, `convert` and `recover --method highpass` on 2 to 128 M events of a 346 x 260 sensor.
+- `cases`: the reference cases, with POLARNET_SHARED: what their table says of each and of polarnet before,
+  and what their tests see now.
 """
 
 import argparse
 import functools
 import json
 import os
+import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +36,7 @@ from studies.study import (
     command_line,
     in_own_process,
     machine_record,
-    passed,
+    outcomes,
     write_section,
 )
 
@@ -43,7 +46,7 @@ REPEATS = 3
 SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_csv": (800, 1280), "celex5_bin": (800, 1280)}
 SENSOR = 720, 1280  # of the other formats
 PARTS = {"m3ed": "left", "mvsec": "left"}
-MEMORY_SIZES = (2_000_000, 8_000_000, 32_000_000)
+MEMORY_SIZES = (2_000_000, 8_000_000, 32_000_000, 128_000_000)
 MEMORY_SENSOR = 260, 346
 MEMORY_FORMS = ("evt3", "hdf5", "text")
 COMMANDS: dict[str, list[str]] = {
@@ -164,17 +167,43 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
                 peaks[size] = {name: measured(name, str(path)) for name in (*COMMANDS, "array")}
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
-        few, many = MEMORY_SIZES[1:]
+        few, many = MEMORY_SIZES[1:3]
         arrays[form] = round((peaks[many]["array"] - peaks[few]["array"]) * MIB / (many - few), 2)
     return {"commands": rows, "bytes_per_event": arrays}, {"bytes_per_event_max": max(arrays.values())}
 
 
 def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
-    """Tests of the reference cases."""
+    """The table of the reference cases, and what their tests see now."""
     if "POLARNET_SHARED" not in os.environ:
         raise SystemExit("--sections cases: set POLARNET_SHARED to the folder with cases/recordings")
-    right = passed("tests/recordings/test_cases.py")
-    return {"right": right}, {"cases_right": sum(right.values()), "cases_total": len(right)}
+    tests = outcomes("tests/recordings/test_cases.py")
+    text = Path(os.environ["POLARNET_SHARED"], "cases", "recordings", "README.md").read_text(encoding="utf-8")
+    table = []
+    for row in re.findall(r"(?m)^\| (`.*) \|$", text):
+        files, situation, before = row.split(" | ")
+        seen: dict[str, Any] = {}
+        for name, test in tests.items():
+            file = name.partition("[")[2][:-1]
+            if any(fnmatch(file.partition("/")[0], pattern) for pattern in patterns_of(files)):
+                seen[file] = "; ".join(filter(None, [seen.get(file), test.get("now") if test["passed"] else "failed"]))
+        table.append({"files": files, "situation": situation, "before": before, "now": one_line(seen)})
+    right = {name: test["passed"] for name, test in tests.items()}
+    return {"table": table, "right": right}, {"cases_right": sum(right.values()), "cases_total": len(right)}
+
+
+def patterns_of(files: str) -> list[str]:
+    """Patterns of the file names in a cell, in which `a_{1,2}.txt` stands for two."""
+    return [re.sub(r"\{.*\}", "*", name) for name in re.findall("`([^`]+)`", files)]
+
+
+def one_line(seen: Mapping[str, str]) -> str:
+    """What was seen of each file; files of which the same was seen stand together."""
+    files: dict[str, list[str]] = {}
+    for file, what in seen.items():
+        files.setdefault(what, []).append(file)
+    if len(files) == 1:
+        return next(iter(files))
+    return "<br>".join(f"`{', '.join(names)}`: {what}" for what, names in files.items())
 
 
 ONE: dict[str, Callable[[str], Any]] = {

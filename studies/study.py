@@ -72,13 +72,24 @@ def in_own_process(module: str, *words: object) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def passed(*tests: str) -> dict[str, bool]:
-    """Whether each case of these tests passed, by its name; a skipped one did not. Tests are named as pytest does."""
+def outcomes(*tests: str) -> dict[str, dict[str, Any]]:
+    """Of each case of these tests, by its name: `passed`, which a skipped one has not, and the properties it recorded.
+
+    Tests are named as pytest does.
+    """
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.xml")
-        subprocess.run([sys.executable, "-m", "pytest", *tests, f"--junitxml={report}"], cwd=ROOT, check=False)
-        cases = ElementTree.parse(report).getroot().iter("testcase")
-        return {str(case.get("name")): len(case) == 0 for case in cases}
+        options = ["-o", "junit_family=xunit1", f"--junitxml={report}"]
+        subprocess.run([sys.executable, "-m", "pytest", *tests, *options], cwd=ROOT, check=False)
+        cases = list(ElementTree.parse(report).getroot().iter("testcase"))
+    not_passed = ("failure", "error", "skipped")
+    return {
+        str(case.get("name")): {
+            "passed": not any(case.find(kind) is not None for kind in not_passed),
+            **{str(one.get("name")): one.get("value") for one in case.iter("property")},
+        }
+        for case in cases
+    }
 
 
 def read_results(root: Path, name: str) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.clips import TIMES_FILE, Clip, ClipFrame, ClipOptions, check_times, open_clip, times_from_file
 from polarnet.pictures.images import fit
 from polarnet.recordings.writers import h5py_module
+from polarnet.runtime.files import claimed
 from polarnet.runtime.machine import configure, threads_of
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.scene import PolarizationScene, scene_from_intensities, scene_from_light, scene_from_rgb
@@ -40,10 +41,12 @@ def demo(options: argparse.Namespace) -> int:
 
     started = time.monotonic()
     photograph = next(photo.path for photo in BUILTIN_PHOTOS if photo.path.stem == PHOTOGRAPH)
-    simulated, recovered = (options.out.resolve() / name for name in ("simulated", "recovered"))
-    print(f"simulating {photograph.name}; the first run also compiles the simulation")
-    status = main(["simulate", str(photograph), *options.overrides, "--out", str(simulated)])
-    status = status or main(["recover", str(simulated / "events.zarr"), "--truth", "--out", str(recovered)])
+    out = options.out.resolve()
+    simulated, recovered = out / "simulated", out / "recovered"
+    with claimed(out):  # both, so that the recovery is that of this simulation
+        print(f"simulating {photograph.name}; the first run also compiles the simulation")
+        status = main(["simulate", str(photograph), *options.overrides, "--out", str(simulated)])
+        status = status or main(["recover", str(simulated / "events.zarr"), "--truth", "--out", str(recovered)])
     if status == 0:
         print(f"video       {recovered / 'recovered.mp4'}, with the truth")
         print(f"done in     {time.monotonic() - started:.0f} s; open {recovered / 'index.html'}")

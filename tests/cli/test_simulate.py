@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 import zarr
+from filelock import FileLock
 
 from polarnet.cli import main, simulated_files
 from polarnet.clips import simulate_video, video
@@ -341,3 +342,10 @@ def test_demo_recovers_a_photograph_better_than_its_mean(tmp_path, capsys):
     error = np.square(dolp[5:] - truth[6:]).mean(axis=(1, 2))
     assert len(dolp) == len(truth) - 1
     assert error.mean() < truth[6:].var(axis=(1, 2)).mean()
+
+
+def test_a_demo_is_refused_where_another_process_writes_one(tmp_path, capsys):
+    with FileLock(tmp_path / "demo.lock.tmp"):
+        assert main(["demo", "--out", str(tmp_path / "demo"), *SMALL]) == 1
+    assert f"{tmp_path / 'demo'}: another process is writing it" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()

@@ -1,4 +1,7 @@
-"""Files of the reference cases: layouts that once failed, and controls. Their kinds have tests of their own beside."""
+"""Files of the reference cases: layouts that once failed, and controls. Their kinds have tests of their own beside.
+
+Each test records what it saw as the property "now", for the table of `studies.recordings`.
+"""
 
 import pytest
 
@@ -83,6 +86,11 @@ REFUSED = {
 }
 
 
+def mended(repairs):
+    """Repairs in words, such as "; time_glitches: 1"; empty if there were none."""
+    return "".join(f"; {kind}: {count}" for kind, count in repairs.items())
+
+
 @pytest.fixture
 def cases(shared):
     for package in ("faery", "h5py", "hdf5plugin", "rosbags"):
@@ -92,24 +100,29 @@ def cases(shared):
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", CASES)
-def test_a_case_has_the_events_that_it_was_written_with(cases, read, name):
+def test_a_case_has_the_events_that_it_was_written_with(cases, read, name, record_property):
     arguments, stated, count, expected = CASES[name]
     form, (t, *columns), repairs = read(cases / name, **arguments)
+    first = f", the first at {t[0]} us, x={columns[0][0]}, y={columns[1][0]}" if len(t) else ""
+    record_property("now", f"{len(t)} events{first}{mended(repairs)}")
     assert (form, len(t), repairs) == (stated, count, REPAIRED.get(name, {}))
     assert (*t[:1], *t[-1:], *(column[:3] for column in columns)) == expected
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", LIVE)
-def test_a_case_goes_on_live(cases, name):
+def test_a_case_goes_on_live(cases, name, record_property):
     with (cases / name).open("rb") as file:
         live = LiveLines(file, name, ((90, 45), (135, 0)), idle_s=0.0)
         events = sum(len(channel) for piece in live for channel in piece.channels)
-    assert (events, {kind: count for kind, count in live.counts.items() if count}) == LIVE[name]
+    repairs = {kind: count for kind, count in live.counts.items() if count}
+    record_property("now", f"live {events} events{mended(repairs)}")
+    assert (events, repairs) == LIVE[name]
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_case_that_cannot_be_read_as_it_is_says_why(cases, name):
-    with pytest.raises(RecordingError, match=REFUSED[name]):
+def test_a_case_that_cannot_be_read_as_it_is_says_why(cases, name, record_property):
+    with pytest.raises(RecordingError, match=REFUSED[name]) as refused:
         read_recording(cases / name, **({} if name != "v2e_47_polarity.h5" else VGA))
+    record_property("now", f"refused: {refused.value}".replace(f"{cases}/", ""))
