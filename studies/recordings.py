@@ -18,7 +18,6 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -184,16 +183,18 @@ def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
         seen: dict[str, Any] = {}
         for name, test in tests.items():
             file = name.partition("[")[2][:-1]
-            if any(fnmatch(file.partition("/")[0], pattern) for pattern in patterns_of(files)):
+            if named(file, files):
                 seen[file] = "; ".join(filter(None, [seen.get(file), test.get("now") if test["passed"] else "failed"]))
         table.append({"files": files, "situation": situation, "before": before, "now": one_line(seen)})
     right = {name: test["passed"] for name, test in tests.items()}
     return {"table": table, "right": right}, {"cases_right": sum(right.values()), "cases_total": len(right)}
 
 
-def patterns_of(files: str) -> list[str]:
-    """Patterns of the file names in a cell, in which `a_{1,2}.txt` stands for two."""
-    return [re.sub(r"\{.*\}", "*", name) for name in re.findall("`([^`]+)`", files)]
+def named(file: str, files: str) -> bool:
+    """Whether a cell names a file or the folder that it lies in; `a_{1,2}.txt` stands for two."""
+    names = re.findall("`([^`]+)`", files)
+    patterns = (re.escape(name).replace(r"\{", "(").replace(r"\}", ")").replace(",", "|") for name in names)
+    return any(re.fullmatch(f"{pattern}(/.*)?", file) for pattern in patterns)
 
 
 def one_line(seen: Mapping[str, str]) -> str:
