@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, as_tensor, check_floating, check_same_shape, check_shape
@@ -40,6 +40,25 @@ class Prediction(NamedTuple):
     """Intensities behind the polarizers at 0, 45, 90 and 135 degrees from which DoLP was computed.
 
     c is 4, or 1 for a camera without polarizers, whose `dolp` is NaN."""
+
+
+class StokesFrames(NamedTuple):
+    """What the frames of a polarization camera show of s1 = S1 / S0 and s2 = S2 / S0."""
+
+    t_us: Int64[np.ndarray, " n"]
+    """Times of the frames; they increase."""
+    stokes: Float[Tensor, "n 2 h w"]
+    valid: Bool[Tensor, "n h w"]
+    """Whether a pixel is known, such as one that is not saturated."""
+
+    def since(self, t_us: int) -> "StokesFrames":
+        """The same frames by a clock that starts at `t_us` of this one."""
+        return self._replace(t_us=self.t_us - t_us)
+
+    def between(self, start_us: int, stop_us: int) -> "StokesFrames":
+        """The frames of this time, both ends included."""
+        first, last = np.searchsorted(self.t_us, [start_us, stop_us + 1])
+        return StokesFrames(self.t_us[first:last], self.stokes[first:last], self.valid[first:last])
 
 
 def stokes_from_intensities(intensities: Float[Array, "*b 4 h w"]) -> Float[Tensor, "*b 3 h w"]:

@@ -9,7 +9,9 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
 
 `ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
---whole-file has `registered` in their place, the network over the whole recording. `train_mean` is the mean DoLP of
+--whole-file has `registered` in their place, the network over the whole recording. --frames has it, and for each
+entry of FRAMES_HZ the same with frames of the camera (`recover --frames`) and the frame nearest in time, held: frames
+of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. `train_mean` is the mean DoLP of
 the training photographs, `constant_real` that of the measured scenes of all other
 sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
@@ -20,8 +22,10 @@ folders: a network trained on them (`ingest.root`) has seen no photograph of --s
 import argparse
 import functools
 import json
+import math
 import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,32 +34,38 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from polarnet.benchmark.rows import Context, available, predictions_of
+from polarnet.benchmark.rows import Context, available, predicted_over, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
 from polarnet.events.stream import Events
+from polarnet.methods import METHODS
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
-from polarnet.runtime.machine import configure
+from polarnet.runtime.machine import configure, generator_for
 from polarnet.simulation.camera import grid
 from polarnet.simulation.dataset import motion_over
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.truth import frames_of, valid_frames
-from polarnet.stokes import Prediction
+from polarnet.stokes import Prediction, StokesFrames, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 from studies.study import arguments_of, command_line, machine_record, write_section
 
-OURS, WHOLE, WHOLE_FILE = "ours", "registered", "whole_file"
+OURS, WHOLE = "ours", "registered"
+PAST, WHOLE_FILE, FRAMES = "", "whole_file", "frames"
+"""What the network sees: events so far, those of the whole recording, or also frames; sections are named after them."""
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
+FRAMES_HZ = (1, 5, 20)  # of the camera
+EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
+FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 SENSORS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -120,12 +130,12 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
 
 
 def contexts_of(
-    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path], whole_file: bool
+    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path], mode: str
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
     config = settings(*overrides)
     contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in weights.items()}
-    if whole_file:
+    if mode != PAST:
         return contexts
     variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
@@ -137,7 +147,7 @@ def contexts_of(
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float, whole_file: bool
+    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float, mode: str
 ) -> Scores:
     """Scores of all methods on one sequence, without the windows of the warm-up."""
     test = simulated(scenes, name, config)
@@ -147,8 +157,10 @@ def scored_sequence(
     predictions[CONSTANT] = Prediction(torch.full_like(test.dolp, constant))
     for row, context in contexts.items():
         predictions[row] = predictions_of([OURS], test, context)[OURS]
-    if whole_file:
+    if mode != PAST:
         predictions |= predictions_of([WHOLE], test, first_context)
+    if mode == FRAMES:
+        predictions |= with_frames(scenes, test, first_context)
     warmup = warmup_windows(config)
     scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
@@ -160,6 +172,36 @@ def scored_sequence(
     }
     truth = test.dolp[first:] if valid is None else test.dolp[first:][valid]
     return Scores(scores, {test.scene: float(truth.mean())}, errors)
+
+
+def with_frames(scenes: SceneStore, test: TestSequence, context: Context) -> dict[str, Prediction]:
+    """`registered` with frames, and the nearest frame, for each rate of FRAMES_HZ."""
+    predictions = {}
+    method, windows = METHODS[WHOLE], test.windows_for(False)
+    for rate_hz in FRAMES_HZ:
+        frames = camera_frames(scenes, test.name, int(test.t_us[-1]), rate_hz)
+        recoverer = method.open(replace(context.setups[method.section], frames=frames))
+        predictions[f"{WHOLE}, {rate_hz} frames/s"] = predicted_over(recoverer, windows)
+        nearest = np.abs(frames.t_us - test.t_us[1:, None].numpy()).argmin(1)
+        s1, s2 = frames.stokes[nearest].unbind(1)
+        aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
+        predictions[f"nearest of {rate_hz} frames/s"] = Prediction(torch.hypot(s1, s2).clamp(max=1), aolp)
+    return predictions
+
+
+def camera_frames(scenes: SceneStore, name: str, stop_us: int, rate_hz: float) -> StokesFrames:
+    """Frames of a camera on the path of a stored sequence, from the middle of the first exposure on."""
+    scene, trajectory, _ = motion_over(scenes, name)
+    pixels = grid(scenes.attributes["layout"], scenes.sensor_height, scenes.sensor_width)
+    t_us = np.arange(EXPOSURE_US // 2, stop_us, round(1e6 / rate_hz))
+    exposed = (t_us[:, None] + np.linspace(-EXPOSURE_US / 2, EXPOSURE_US / 2, EXPOSED)).clip(0, stop_us).ravel()
+    light = frames_of(scene, trajectory, exposed.round().astype(int).tolist(), *pixels)[0]
+    light = light.unflatten(0, (len(t_us), EXPOSED)).mean(1)
+    random = generator_for(0, name, "frames").standard_normal(light.shape, np.float32)
+    noise = torch.from_numpy(random) * (light / FULL_WELL + READ_NOISE**2).sqrt()
+    s0, s1, s2 = stokes_from_intensities(((light + noise).clamp(0, 1) * DIGITS).round()).unbind(1)
+    stokes = torch.stack([s1, s2], dim=1) / s0.clamp(min=1)[:, None]
+    return StokesFrames(t_us, stokes, s0 > 0)
 
 
 def sequence_at(scenes: SceneStore, name: str, events: Sequence[Events], t_us: Int64[Tensor, " n"]) -> TestSequence:
@@ -230,7 +272,7 @@ def tables_of(
     train_mean: float,
     weights: Mapping[str, Path],
     common: Sequence[str],
-    whole_file: bool,
+    mode: str,
 ) -> dict[str, Any]:
     """Score every condition; returns its table, and one of all measured scenes. `means` has the mean DoLP by source."""
     results: dict[str, Scores] = {}
@@ -240,7 +282,7 @@ def tables_of(
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
             config = settings(*common, *overrides)
-            contexts = contexts_of(name, (*common, *overrides), train_mean, weights, whole_file)
+            contexts = contexts_of(name, (*common, *overrides), train_mean, weights, mode)
             scenes = scenes_of(images, config)
             task = functools.partial(
                 scored_sequence,
@@ -248,7 +290,7 @@ def tables_of(
                 config=config,
                 contexts=contexts,
                 constant=constant,
-                whole_file=whole_file,
+                mode=mode,
             )
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
@@ -275,6 +317,7 @@ def main() -> None:
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
     parser.add_argument("--whole-file", action="store_true", help="the row `registered` beside `ours`")
+    parser.add_argument("--frames", action="store_true", help="the same, and with frames; needs measured scenes")
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
@@ -299,13 +342,17 @@ def main() -> None:
         conditions = {
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
-    whole = arguments.whole_file
-    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, whole)
-    figures = {WHOLE_FILE: headlines(tables, WHOLE)} if whole else headlines(tables, next(iter(arguments.weights)))
+    mode = FRAMES if arguments.frames else WHOLE_FILE if arguments.whole_file else PAST
+    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, mode)
+    if mode == FRAMES:
+        rows = tables["measured"]["rows"]
+        figures = {FRAMES: {"mse_over_events_only": rows[f"{WHOLE}, 5 frames/s"]["mse"] / rows[OURS]["mse"]}}
+    else:
+        figures = {mode: headlines(tables, WHOLE)} if mode else headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}
-    part = f"{WHOLE_FILE}_{arguments.split}" if whole else arguments.split
+    part = f"{mode}_{arguments.split}" if mode else arguments.split
     (arguments.work / f"robustness_{part}.json").write_text(json.dumps(section, indent=2) + "\n")
     if arguments.write:
         write_section("robustness", part, section, record, figures if arguments.split == "test" else None)

@@ -42,7 +42,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
             prediction = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
         else:
             method = METHODS[name]
-            prediction = _run(opened(method, context), sequence.windows_for(method.rotating))
+            prediction = predicted_over(opened(method, context), sequence.windows_for(method.rotating))
         predictions[name] = each_map(prediction, Tensor.cpu)
         for maps in prediction:
             if maps is not None and not (finite := maps.isfinite().flatten(1).all(1)).all():
@@ -53,7 +53,7 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
     return predictions
 
 
-def _run(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
+def predicted_over(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
     """DoLP, AoLP and expected error over consecutive windows, one at a time as from a camera, or as from a file."""
     first = windows[0].channels[0]
     state = recoverer.start(first.height, first.width)

@@ -23,10 +23,18 @@ from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
-from polarnet.recovery.inputs import Files, half_turn_rule, open_files, open_live, open_rotating, rotation_of
+from polarnet.recovery.inputs import (
+    Files,
+    half_turn_rule,
+    open_files,
+    open_frames,
+    open_live,
+    open_rotating,
+    rotation_of,
+)
 from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
 from polarnet.terminal.suggestions import did_you_mean
@@ -38,11 +46,13 @@ RECONSTRUCT = "highpass"
 NETWORK_WINDOW = "33.333ms"
 ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
 """Options that say where the polarizers are."""
-NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "size", "part", *READING)
+NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "frames", "size", "part", *READING)
 NOT_ROTATING = (
-    "angles", "mosaic", "sequence", "truth", "method", "weights", "thresholds", "binning", "window", *CLEANING,
+    "angles", "mosaic", "sequence", "truth", "frames", "method", "weights", "thresholds", "binning", "window",
+    *CLEANING,
 )  # fmt: skip
 """Options without a meaning for live input, and for one camera behind a rotating polarizer."""
+NOT_WITH_FRAMES = ("size", "step")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -52,12 +62,13 @@ def run(options: argparse.Namespace) -> None:
     setup = functools.partial(setup_of, config)
     source, rotation, rule = _rotating(options)
     method = options.method or (ROTATING_METHOD if rotation else _network_method(options, setup))
-    settings = options.weights, options.precision, options.thresholds, options.binning, rotation
+    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
+    frames = _frames_of(options, mosaic)
+    settings = options.weights, options.precision, options.thresholds, options.binning, rotation, frames
     recoverer, words = open_method(ChosenMethod(method, *settings), setup)
     truth = _truth_of(options)
     scores = TruthScores(truth) if truth else None
     out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
-    mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     cleaner = Cleaner(cleaning_of(options), mosaic)
     with run_folder(out, "recover") as folder:
         if options.live:
@@ -70,10 +81,10 @@ def run(options: argparse.Namespace) -> None:
         drawn = polarized and "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
         writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
-        frames = frames_of(source, rule, recoverer)
+        recovered = frames_of(source, rule, recoverer)
         if scores:
-            frames = scores.watch(frames)
-        facts = recover(source, rule, words, writer, frames)
+            recovered = scores.watch(recovered)
+        facts = recover(source, rule, words, writer, recovered)
         if check:
             counts = zip(POLARIZER_ANGLES_DEG, check.counts, strict=True)
             facts["events"] = ", ".join(f"{count:,} at {angle}" for angle, count in counts) + " degrees"
@@ -82,6 +93,8 @@ def run(options: argparse.Namespace) -> None:
         if given(options, CLEANING):
             facts["removed"] = cleaner.sentence()
         notes = check.findings() if check else []
+        if frames is not None and not len(frames.between(0, writer.stop_us).t_us):
+            notes.append(f"none of its {len(frames.t_us)} frames lies within the events: are they on one clock?")
         for name, repairs in source.repairs.items():
             damage = ((kind, count) for kind, count in repairs.items() if count and kind not in HARMLESS)
             notes += [f"{name}: {count:,} {REPAIRS[kind]}." for kind, count in damage]
@@ -125,6 +138,15 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
     return open_files(files, work, options.size, cleaner)
 
 
+def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:
+    """The camera's frames of option --frames; ValueError without --mosaic."""
+    if not options.frames:
+        return None
+    if mosaic is None:
+        raise ValueError("--frames: expected --mosaic, the polarizers of the camera's pixels")
+    return open_frames(Path(options.input[0]), mosaic, functools.partial(open_recording, **reading_of(options)))
+
+
 def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
     """True frames of option --truth; ValueError if the input is not a store with them."""
     if options.truth is None:
@@ -155,6 +177,8 @@ def check_options(options: argparse.Namespace) -> None:
         refuse(options, "--rotating", NOT_ROTATING)
     else:
         refuse(options, "without --rotating or --triggers", ["start_angle"])
+    if options.frames:
+        refuse(options, "--frames", NOT_WITH_FRAMES)
     if (options.live or rotating) and len(options.input) != 1:
         raise ValueError(f"{'--live' if options.live else '--rotating'}: expected one input, got {len(options.input)}")
     if not Path(options.input[0]).is_dir() or is_recording(Path(options.input[0])):

@@ -15,7 +15,7 @@ from polarnet.methods.registration import RegistrationConfig
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.runtime.files import sha256
 from polarnet.runtime.sections import section
-from polarnet.stokes import Prediction
+from polarnet.stokes import Prediction, StokesFrames
 
 PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes at once; bounds the memory of a network
 
@@ -65,6 +65,8 @@ class Setup:
     """Precision of networks: fp32, or bf16 autocast."""
     rotation: Rotation | None
     """Angle of the polarizer over time, for methods of one camera behind a rotating polarizer."""
+    frames: StokesFrames | None = None
+    """The camera's own frames, by the clock of the windows, for a method that takes them (`Method.takes_frames`)."""
 
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
@@ -157,6 +159,8 @@ class Method:
     """Whether the package carries weights, which `polarnet recover` uses if it is given none."""
     rotating: bool = False
     """Whether the method needs the events of one camera behind a rotating polarizer instead of four channels."""
+    takes_frames: bool = False
+    """Whether the method uses the camera's own frames where there are some (`Setup.frames`)."""
     reconstructs: bool = False
     """Whether DoLP is computed from reconstructed intensities, held by `Prediction.intensities`."""
     about: str = ""

@@ -124,6 +124,13 @@ def register(counts: Float32[np.ndarray, "4 2 k h w"], config: RegistrationConfi
     return Panorama(images, _coverage(x, y, (height, width), size) > 0.5, x, y)
 
 
+def at_rest(height: int, width: int, times: int) -> Panorama:
+    """The panorama of a sensor that does not move: one view, without contrasts."""
+    size = _even(height + 1 + 2.0 * MARGIN), _even(width + 1 + 2.0 * MARGIN)
+    place = np.full(times, float(MARGIN))
+    return Panorama(np.zeros((4, *size), np.float32), np.ones(size, bool), place, place)
+
+
 def unexplained(panorama: Panorama, counts: Float32[np.ndarray, "4 2 k h w"]) -> Float32[np.ndarray, "h w"]:
     """Energy of the changes that the panorama leaves over around each pixel, as a share of their energy.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
@@ -21,9 +22,10 @@ from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.truth import read_truth
 from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import METADATA, unknown_sequence
 
@@ -74,6 +76,24 @@ def open_rotating(
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
     return _input(path.name, channels, size), rotation.since(int(first[0].t[0]))
+
+
+def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
+    """The frames of a recording, whose times count from its first event as those of `open_files` do.
+
+    RecordingError for a file without events, of another format than those with frames, or without frames.
+    """
+    truth, reader = read_truth(path, mosaic), open_file(path)
+    if truth.dolp.shape[1:] != (reader.height // 2, reader.width // 2):
+        height, width = truth.light.shape[1:]
+        raise RecordingError(
+            f"{path.name}: expected frames of the sensor's {reader.height}x{reader.width} px, got {height}x{width}"
+        )
+    first = next(iter(reader), None)
+    if first is None:
+        raise RecordingError(f"{path.name}: expected events, the file has none")
+    s1, s2 = truth.dolp * torch.cos(2 * truth.aolp), truth.dolp * torch.sin(2 * truth.aolp)
+    return StokesFrames(truth.t_us, torch.stack([s1, s2], dim=1), truth.valid).since(int(first.t[0]))
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:

@@ -31,7 +31,7 @@ from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.ahead import Ahead
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on, tune
-from polarnet.stokes import Prediction
+from polarnet.stokes import Prediction, StokesFrames
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 
@@ -100,6 +100,8 @@ class ChosenMethod:
     """Side in pixels of the blocks that the network sees; None: that of the method's section."""
     rotation: Rotation | None = None
     """Angle of the rotating polarizer before the camera, by the clock of the events."""
+    frames: StokesFrames | None = None
+    """Frames of the camera, by the clock of the events."""
 
 
 def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tuple[Recoverer, str]:
@@ -110,7 +112,14 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
     tune()
     method = METHODS[chosen.name]
     setup = setup_of(method)
-    setup = replace(setup, precision=precision_on(setup.device, chosen.precision), rotation=chosen.rotation)
+    setup = replace(
+        setup,
+        precision=precision_on(setup.device, chosen.precision),
+        rotation=chosen.rotation,
+        frames=chosen.frames,
+    )
+    if chosen.frames is not None and not method.takes_frames:
+        raise ValueError(f"--frames is for --method {', '.join(_framed())}, {method.name} does not use them")
     for option, value in (("thresholds", chosen.thresholds), ("binning", chosen.binning)):
         if value is not None and not hasattr(setup.config, option):
             raise ValueError(f"--{option} is for the DoLP network, {method.name} does not use it")
@@ -127,7 +136,13 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
         raise ValueError(f"--method {method.name}: {reason}")
     recoverer = method.open(setup)
     whole = ", over the whole recording (--method ours: only the past)" if recoverer.sees_ahead else ""
+    if chosen.frames is not None:
+        whole += f", with {len(chosen.frames.t_us)} frames of the camera"
     return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
+
+
+def _framed() -> list[str]:
+    return [name for name, method in METHODS.items() if method.takes_frames]
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:

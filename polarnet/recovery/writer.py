@@ -98,7 +98,7 @@ class RecoveryWriter:
         self.folder, self.outputs = folder, outputs
         self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
-        self.frames = 0
+        self.frames = self.stop_us = 0
         self._plain = False
         self._sample = _Sample([])
         self._scale = EventScale()
@@ -130,6 +130,7 @@ class RecoveryWriter:
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
         self._wait(0 if live and usable_cores() <= FEW_CORES else MAX_QUEUED)
         self.frames += 1
+        self.stop_us = window.stop_us
 
     def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""

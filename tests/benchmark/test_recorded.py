@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+import zarr
 
 from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main
@@ -142,3 +143,27 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     (note,) = clean.notes
     assert "of 1 hot pixels" in note
     assert mosaicked(truth.intensity.numpy()).shape == truth.light.shape
+
+
+def test_recover_takes_the_frames_of_the_camera_and_says_where_it_cannot(recording, made, tmp_path, capsys):
+    def run(*more, out="out"):
+        return main(["recover", str(recording), *more, "--out", str(tmp_path / out), "--write", "zarr"])
+
+    mosaic = ["--mosaic", " / ".join(" ".join(map(str, row)) for row in MOSAIC)]
+    for out, more in (("frames", ["--frames"]), ("events", [])):
+        assert run(*mosaic, *more, out=out) == 0
+    known = FrameStore.open(made / "set" / "frames.zarr")
+    dolp = known.frames(known.sequences[0]).dolp.numpy()
+    errors = {}
+    for out in ("frames", "events"):
+        found = np.asarray(zarr.open_group(tmp_path / out / "recovered.zarr", mode="r")["dolp"]) / 65535
+        errors[out] = np.square(found - dolp[1 : 1 + len(found)]).mean()
+    assert errors["frames"] < 0.2 * errors["events"]
+    assert f"with {len(dolp)} frames of the camera" in capsys.readouterr().out
+    for more, reason in (
+        ([], "--frames: expected --mosaic"),
+        ([*mosaic, "--method", "cf"], "--frames is for --method registered, cf does not use them"),
+        ([*mosaic, "--step", "1ms"], "--frames: expected no --step"),
+    ):
+        assert run("--frames", *more) == 1
+        assert reason in capsys.readouterr().err

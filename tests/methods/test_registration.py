@@ -4,12 +4,13 @@ import torch
 from method_fixtures import REGISTRATION
 
 from polarnet.events.representations import event_counts
-from polarnet.events.stream import slice_time
+from polarnet.events.stream import select, slice_time
 from polarnet.events.streaming import EventWindow, encode_windows, windows_of
 from polarnet.methods import METHODS
 from polarnet.methods.registration import Panorama, mosaic, offset_field, register, views
 from polarnet.networks.weights import shipped_weights
 from polarnet.simulation import MOTIONS, SENSORS, scene_from_polarization, simulate
+from polarnet.stokes import StokesFrames
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +119,45 @@ def test_the_networks_own_maps_stay_where_there_is_nothing_to_register(case, win
             state, prediction = recoverer.step(state, [window] if case == "one window" else window)
         maps.append(prediction.dolp)
     torch.testing.assert_close(*maps, atol=1e-5, rtol=0)
+
+
+def frames_at(simulated, places):
+    """Frames that show the true polarization of these windows' ends, but for one corner."""
+    dolp, aolp = (field[torch.tensor(places)] for field in (simulated.dolp, simulated.aolp))
+    valid = torch.ones_like(dolp, dtype=torch.bool)
+    valid[:, :20, :20] = False
+    stokes = torch.stack([dolp * torch.cos(2 * aolp), dolp * torch.sin(2 * aolp)], dim=1)
+    stokes[:, :, :20, :20] = torch.nan
+    return StokesFrames(simulated.t_us.numpy()[places], stokes.float(), valid)
+
+
+def test_what_frames_show_is_carried_along_the_motion_and_frames_of_another_time_change_nothing(
+    simulated, windows, open_shipped
+):
+    frames = frames_at(simulated, [3, 15, 27])
+    maps = {}
+    for name, given in (("none", None), ("frames", frames), ("of another time", frames.since(2_000_000))):
+        recoverer = open_shipped("registered", frames=given)
+        maps[name] = recoverer.step(recoverer.start(120, 180), windows)[1]
+    assert torch.equal(maps["none"].dolp, maps["of another time"].dolp)
+    dolp, aolp = simulated.dolp[1:], simulated.aolp[1:]
+    errors = {name: (maps[name].dolp - dolp).square().mean() for name in ("none", "frames")}
+    assert errors["frames"] < 0.25 * errors["none"]
+    turned = torch.remainder(maps["frames"].aolp - aolp + torch.pi / 2, torch.pi) - torch.pi / 2
+    assert turned[dolp > 0.2].abs().mean() < 0.1
+    assert maps["frames"].log_variance.exp().mean() < 0.5 * maps["none"].log_variance.exp().mean()
+
+
+def test_frames_of_a_camera_at_rest_are_averaged_where_nothing_happens_and_else_the_nearest_counts(
+    simulated, windows, open_shipped
+):
+    nothing = [slice_time(events, 0, 0) for events in windows[0].channels]
+    corner = [select(events, (events.x >= 150) & (events.y >= 90)) for events in windows[0].channels]
+    still = [EventWindow(corner if k else nothing, 33_333 * k, 33_333 * (k + 1)) for k in range(10)]
+    frames = frames_at(simulated, [2, 8])
+    recoverer = open_shipped("registered", frames=frames)
+    _, prediction = recoverer.step(recoverer.start(120, 180), still)
+    mean, last = frames.stokes.mean(0), frames.stokes[1]
+    torch.testing.assert_close(prediction.stokes[9, :, 30:70, 30:100], mean[:, 30:70, 30:100], atol=1e-4, rtol=0)
+    torch.testing.assert_close(prediction.stokes[9, :, 110:, 170:], last[:, 110:, 170:], atol=1e-4, rtol=0)
+    assert prediction.dolp.isfinite().all()
