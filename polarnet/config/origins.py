@@ -60,7 +60,8 @@ def pipeline(root: Path, params: Mapping[str, Any]) -> dict[str, Stage]:
         for item, values in _items(content, params):
             full = name if item is None else f"{name}@{item}"
             one = _filled(content.get("do", content), {**params, **values})
-            outs = [*one.get("outs", ()), *(next(iter(out)) for out in one.get("metrics", ()))]
+            outs = [out if isinstance(out, str) else next(iter(out))
+                    for out in (*one.get("outs", ()), *one.get("metrics", ()))]  # fmt: skip
             stages[full] = Stage(full, shlex.split(one["cmd"]), one.get("params", []), one.get("deps", []), outs)
     return stages
 
@@ -77,7 +78,7 @@ def _items(content: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[tu
 def _filled(content: Any, values: Mapping[str, Any]) -> Any:
     """Replace the templates in all texts of `content`, as DVC does."""
     if isinstance(content, dict):
-        return {key: _filled(value, values) for key, value in content.items()}
+        return {_filled(key, values): _filled(value, values) for key, value in content.items()}
     if isinstance(content, list):
         return [_filled(value, values) for value in content]
     if not isinstance(content, str):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -25,6 +25,7 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods.dolp_network import METHODS as NETWORKS
 from polarnet.methods.method import Method, Recoverer, Setup, State, each_map, joined
 from polarnet.methods.registration import (
+    NEAR,
     Panorama,
     RegistrationConfig,
     at_rest,
@@ -118,8 +119,7 @@ def registered(known: Past, config: RegistrationConfig, frames: StokesFrames | N
     else:
         joint = _joint(own, panorama, float(known.steps.mean()), config)
     if frames is not None:
-        shown, nearest, seen = _shown(frames, panorama, known.edges_us, (height, width))
-        joint, own = torch.where(seen, shown, joint), torch.where(nearest.isnan(), own, nearest)
+        joint, own = _shown(frames, panorama, known.edges_us, joint)
     all_of_it, nothing = config.unexplained
     left = torch.from_numpy(unexplained(panorama, counts))
     s1, s2, dolp, log_variance = torch.lerp(own, joint, ((nothing - left) / (nothing - all_of_it)).clamp(0, 1))
@@ -150,32 +150,41 @@ def _joint(own: Tensor, panorama: Panorama, step: float, config: RegistrationCon
 
 
 def _shown(
-    frames: StokesFrames, panorama: Panorama, edges_us: np.ndarray, size: tuple[int, int]
-) -> tuple[Float[Tensor, "4 k h w"], Float[Tensor, "4 k h w"], Bool[Tensor, "k h w"]]:
-    """Maps of all frames at the ends of the windows, those of the nearest one (NaN: unknown), and where all show any.
+    frames: StokesFrames, panorama: Panorama, edges_us: np.ndarray, joint: Float[Tensor, "4 k h w"]
+) -> tuple[Float[Tensor, "4 k h w"], Float[Tensor, "4 k h w"]]:
+    """Maps of all frames at the ends of the windows, and of the frame nearest in time; `joint` where they show nothing.
 
-    The frames' own deviations from their mean along the motion are the expected error.
+    The expected error of both is how much single frames deviate from their mean along the motion nearby, and that of
+    `joint` where no place was seen twice.
     """
+    height, width = joint.shape[-2:]
     x, y = (np.interp(frames.t_us, edges_us, place) for place in (panorama.x, panorama.y))
     of_frames = panorama._replace(x=x, y=y)
-    weight = frames.valid.float()
     values = torch.where(frames.valid[:, None], frames.stokes, 0.0).transpose(0, 1).numpy()
-    means, number = mosaic(values, weight.numpy(), of_frames)
-    deviations = np.square(values - views(means, x, y, size)).sum(0) / 2  # of one component
-    more_than_once = views(number[None], x, y, size)[0] > 1.5
-    known = more_than_once & frames.valid.numpy()
-    variance = float(deviations[known].mean()) if known.any() else SMALLEST_VARIANCE
-    stokes, total = (views(images, panorama.x[1:], panorama.y[1:], size) for images in (means * number, number[None]))
-    seen = torch.from_numpy(total[0]) > 0.5
+    means, number = mosaic(values, frames.valid.float().numpy(), of_frames)
+    expected, times = views(means, x, y, (height, width)), views(number[None], x, y, (height, width))[0]
+    again = frames.valid.numpy() & (times > 1.5)
+    deviations = np.square(values - expected).sum(0) / 2 * times / (times - 1).clip(min=0.5)  # of one component
+    nearby = [F.avg_pool2d(torch.from_numpy(sums)[None], NEAR, 1, NEAR // 2)[0].numpy() for sums in
+              _weighted(*mosaic(deviations[None], again.astype(np.float32), of_frames))]  # fmt: skip
+    images = np.concatenate([*_weighted(means, number), *nearby]).astype(np.float32)
+    s1, s2, total, variance, weight = torch.from_numpy(views(images, panorama.x[1:], panorama.y[1:], (height, width)))
+    log_variance = (variance / weight).clamp(min=SMALLEST_VARIANCE).log()
+    log_variance = torch.where(weight > 1e-3, log_variance, joint[3])
     nearest = np.abs(frames.t_us - edges_us[1:, None]).argmin(1)
-    alone = torch.where(frames.valid[:, None], frames.stokes, torch.nan)[nearest].transpose(0, 1)
-    return _with_error(torch.from_numpy(stokes / total.clip(min=0.5)), variance), _with_error(alone, variance), seen
+    maps = []
+    for seen, stokes in (
+        (total > 0.5, torch.stack([s1, s2]) / total.clamp(min=0.5)),
+        (frames.valid[nearest], torch.from_numpy(values)[:, nearest]),
+    ):
+        found = torch.cat([stokes, stokes.square().sum(0).sqrt()[None], log_variance[None]])
+        maps.append(torch.where(seen, found, joint))
+    return maps[0], maps[1]
 
 
-def _with_error(stokes: Float[Tensor, "2 k h w"], variance: float) -> Float[Tensor, "4 k h w"]:
-    """s1, s2, DoLP and log variance."""
-    dolp = stokes.square().sum(0).sqrt()
-    return torch.cat([stokes, dolp[None], torch.full_like(dolp, math.log(max(variance, SMALLEST_VARIANCE)))[None]])
+def _weighted(means: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sums and weights, as images."""
+    return means * weight, weight[None]
 
 
 METHODS = (
