@@ -29,6 +29,7 @@ LARGE = (
 )
 STUDIES = {
     ("robustness", "test"): "studies.robustness " + LARGE,
+    ("robustness", "frames_test"): "studies.robustness --frames --conditions photographs measured " + LARGE,
     ("robustness", "whole_file_test"): "studies.robustness --whole-file --conditions photographs photographs_large "
     "measured " + LARGE,
     ("robustness", "speed"): "studies.speed --only network",

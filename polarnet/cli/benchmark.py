@@ -82,6 +82,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
             used = conditions(config.synthesize, config.emulate)
             about, differences = sentence(used), warnings(used, metadata_used(methods, context))
             print("\n".join([about, *(f"WARNING: {line}" for line in differences)]), flush=True)
+            print("simulating the scenes; the first run also compiles the simulation", flush=True)
             notes = [*differences, *_make_scenes(options, config, root, work)]
         else:
             used, about = {}, RECORDED_SENTENCE

@@ -105,7 +105,7 @@ def _project(command: AddCommand) -> None:
     demo = command(
         "demo",
         "simulate.demo",
-        "a first result in a minute: simulate a built-in photograph, recover its DoLP and score it",
+        "a first result in a few minutes: simulate a built-in photograph, recover its DoLP and score it",
         "demo sensor=noisy",
         description="Simulates a camera with four polarizers that moves over a photograph, recovers DoLP and AoLP from "
         "its events with the shipped weights, and scores them against the truth. `polarnet simulate` and `polarnet "

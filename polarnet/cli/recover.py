@@ -68,7 +68,9 @@ def run(options: argparse.Namespace) -> None:
     recoverer, words = open_method(ChosenMethod(method, *settings), setup)
     truth = _truth_of(options)
     scores = TruthScores(truth) if truth else None
-    out = options.out or Path("outputs") / "recover" / ("live" if options.live else Path(options.input[0]).stem)
+    first = Path(options.input[0])
+    name = "live" if options.live else first.stem if first.is_dir() else first.name  # files may differ in suffix alone
+    out = options.out or Path("outputs") / "recover" / name
     cleaner = Cleaner(cleaning_of(options), mosaic)
     with run_folder(out, "recover") as folder:
         if options.live:

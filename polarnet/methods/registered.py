@@ -39,6 +39,7 @@ from polarnet.stokes import Prediction, StokesFrames
 
 FEWEST = 8  # windows in which a panorama can be found
 MAX_S = 0.98  # limit of s1 and s2, so that atanh is finite
+MISPLACED = 0.2  # share of the variance of single frames that a mean of many keeps, as where the motion is not exact
 SMALLEST_VARIANCE = 1e-5  # of DoLP from frames, such as that of 8 bits
 
 OURS = next(method for method in NETWORKS if method.name == "ours")
@@ -154,7 +155,7 @@ def _shown(
 ) -> tuple[Float[Tensor, "4 k h w"], Float[Tensor, "4 k h w"]]:
     """Maps of all frames at the ends of the windows, and of the frame nearest in time; `joint` where they show nothing.
 
-    The expected error of both is how much single frames deviate from their mean along the motion nearby, and that of
+    The expected error of both is that of the mean, from the deviations of single frames from it nearby, and that of
     `joint` where no place was seen twice.
     """
     height, width = joint.shape[-2:]
@@ -169,7 +170,8 @@ def _shown(
               _weighted(*mosaic(deviations[None], again.astype(np.float32), of_frames))]  # fmt: skip
     images = np.concatenate([*_weighted(means, number), *nearby]).astype(np.float32)
     s1, s2, total, variance, weight = torch.from_numpy(views(images, panorama.x[1:], panorama.y[1:], (height, width)))
-    log_variance = (variance / weight).clamp(min=SMALLEST_VARIANCE).log()
+    of_mean = variance / weight * (1 / total.clamp(min=1) + MISPLACED)
+    log_variance = of_mean.clamp(min=SMALLEST_VARIANCE).log()
     log_variance = torch.where(weight > 1e-3, log_variance, joint[3])
     nearest = np.abs(frames.t_us - edges_us[1:, None]).argmin(1)
     maps = []

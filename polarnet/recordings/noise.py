@@ -74,9 +74,11 @@ class Cleaner:
 
     def sentence(self) -> str:
         """Number of removed events of each kind, in words."""
+        wanted = {"hot pixels": self._cleaning.hot, "background activity": self._cleaning.background_us}
         return ", ".join(
             f"{count:,} events of {f'{self.hot} ' if kind == 'hot pixels' else ''}{kind}"
             for kind, count in self.removed.items()
+            if wanted[kind] is not None
         )
 
     def _found(self, pieces: Iterable[Piece]) -> list[Bool[np.ndarray, "h w"]]:

@@ -174,7 +174,7 @@ def _channels(files: Files, work: Path) -> Channels:
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
         f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
-        f"...; for its intensity alone, give a --method that reconstructs it, such as firenet or highpass"
+        f"...; for its intensity alone, give a --method that reconstructs it, such as e2v or highpass"
     )
 
 

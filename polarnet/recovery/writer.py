@@ -48,7 +48,7 @@ GAP = 4  # pixels between the maps of a picture
 DOLP, INTENSITY, ANGLE, EVENTS = "DoLP", "intensity", "AoLP (hue), DoLP (saturation)", "events"  # captions
 RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
-    "t_us": "time of the frame, microseconds from the first event; without --rate the end of its window",
+    "t_us": "time of the frame, end of its window, microseconds from the first event",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
     "intensity": "intensity from 0 to 1, divided by 65535, of a camera without polarizers; it has no dolp",

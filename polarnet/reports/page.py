@@ -25,6 +25,7 @@ from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import best_row, read_history
 
 OURS = "ours"
+OWN = (OURS, "registered")  # the same network, over the past and over the whole recording
 WORST_SCENES = 5
 MAX_FIGURE_PANELS = 4
 GENERATED = "dead_leaves"
@@ -155,8 +156,9 @@ def _in_words(scenes: Sequence[str], noun: str, generated: Collection[str] = ())
 
 
 def _best_other(method: str, metrics: Scores) -> str | None:
-    """The row with the smallest error beside a method's: neither a constant nor another camera's."""
-    others = [row for row in with_structure(metrics) if row != method and not is_rotating(row)]
+    """The row with the smallest error beside a method's: neither a constant nor another camera's, nor OWN for OURS."""
+    own = OWN if method in OWN else (method,)
+    others = [row for row in with_structure(metrics) if row not in own and not is_rotating(row)]
     return min(others, key=lambda row: metrics[row]["mse"], default=None)
 
 

@@ -129,7 +129,7 @@ def test_listed_hot_pixels_of_a_mosaic_are_those_of_the_sensor(make_events, tmp_
     assert i45.t.tolist() == [1]  # 3 2 is the pixel behind 45 degrees of the cell in column 1, row 1
     assert i135.t.tolist() == [0]  # 0 1 is the pixel behind 135 degrees of the cell in column 0, row 0
     assert i0.t.tolist() == i90.t.tolist() == [0, 1]
-    assert cleaner.sentence() == "2 events of 2 hot pixels, 0 events of background activity"
+    assert cleaner.sentence() == "2 events of 2 hot pixels"
 
 
 def test_found_hot_pixels_are_removed_from_their_channel_alone(make_random_events, make_events):
