@@ -107,6 +107,13 @@ def make_random_events() -> Callable:
     return random_events
 
 
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    from method_fixtures import write_checkpoints
+
+    return write_checkpoints(tmp_path_factory.mktemp("checkpoints"))
+
+
 @pytest.fixture
 def unchecked_annotations() -> Iterator[None]:
     """Run polarnet as a user's program does: annotations are not checked, so that its own checks are on their own."""
