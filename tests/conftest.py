@@ -70,6 +70,10 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_unconfigure() -> None:
+    gc.unfreeze()  # else nanobind reports at exit what was never collected
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put `FIRST` first; `--dist loadfile` hands files out in this order."""
     order = {HERE / name: place for place, name in enumerate(FIRST)}
