@@ -82,6 +82,7 @@ def method(clock, work_s, taken):
         (None, 150, 0.012),
         (None, 150, 0.1),
         (2_000, 746, 0.04),
+        pytest.param(None, 150, 0.04, marks=pytest.mark.thorough),
         *(pytest.param(2_000, 746, work_s, marks=pytest.mark.thorough) for work_s in (0.012, 0.1)),
     ],
 )
