@@ -1,9 +1,11 @@
 """Fixtures and settings of several test modules."""
 
 import dataclasses
+import functools
 import gc
 import importlib
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,27 +13,31 @@ from typing import Any, NamedTuple
 import pytest
 
 HERE = Path(__file__).parent
-SLOWEST_FIRST = (
-    "pipeline/test_stages.py",
+FIRST = (
+    "simulation/test_emulator.py",
     "pipeline/test_dvc.py",
-    "benchmark/test_benchmark.py",
-    "cli/test_benchmark_command.py",
-    "cli/test_simulate.py",
-    "config/test_config.py",
-    "reference/test_golden.py",
+    "pipeline/test_stages.py",
     "training/test_loop.py",
+    "benchmark/test_benchmark.py",
     "networks/test_onnx_export.py",
-    "characterization/test_fit.py",
-    "captures/test_rig.py",
+    "methods/test_methods.py",
+    "config/test_config.py",
+    "cli/test_simulate.py",
+    "cli/test_benchmark_command.py",
     "benchmark/test_recorded.py",
-    "cli/test_fit_sensor.py",
+    "reference/test_golden.py",
+    "captures/test_rig.py",
+    "characterization/test_fit.py",
 )
-"""Files that take longest; the others follow, so no worker is left with a long one when the rest is done."""
+"""Files that workers take first: one compiles the pixel models, the next seven need none of them, then the slowest.
+
+So no two workers compile one kernel at once, and none is left with a long file when the rest is done.
+"""
 LARGE_PACKAGES = (
     "torch", "scipy.stats", "numba", "cv2", "zarr", "matplotlib.figure", "hydra", "pydantic.dataclasses", "ruamel.yaml",
     "jinja2",
 )  # fmt: skip
-FUZZ_CASES = {"local": 50, "ci": 150}
+FUZZ_CASES = {"local": 20, "ci": 150}
 
 
 def pytest_collection() -> None:
@@ -55,15 +61,25 @@ def pytest_collection() -> None:
 
 
 def pytest_collection_finish() -> None:
+    """Check each content of a params.yaml once, which takes half of every `load`; collect no garbage of the modules."""
+    if experiments := sys.modules.get("polarnet.config.experiments"):
+        check = experiments._check_params
+        checked = functools.cache(lambda settings, file, content: check(settings, file))
+        experiments._check_params = lambda settings, file: checked(settings, file, file.read_bytes())
+    gc.freeze()
     gc.enable()
 
 
+def pytest_unconfigure() -> None:
+    gc.unfreeze()  # else nanobind reports at exit what was never collected
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the slowest files first; `--dist loadfile` hands files out in this order."""
-    order = {HERE / name: place for place, name in enumerate(SLOWEST_FIRST)}
+    """Put `FIRST` first; `--dist loadfile` hands files out in this order."""
+    order = {HERE / name: place for place, name in enumerate(FIRST)}
     missing = [str(path) for path in order if not path.exists()]
     if missing:
-        raise pytest.UsageError(f"SLOWEST_FIRST in {__file__} names files that are not there: {', '.join(missing)}")
+        raise pytest.UsageError(f"FIRST in {__file__} names files that are not there: {', '.join(missing)}")
     items.sort(key=lambda item: order.get(item.path, len(order)))
 
 
@@ -105,6 +121,13 @@ def make_random_events() -> Callable:
     from event_fixtures import random_events
 
     return random_events
+
+
+@pytest.fixture(scope="session")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    from method_fixtures import write_checkpoints
+
+    return write_checkpoints(tmp_path_factory.mktemp("checkpoints"))
 
 
 @pytest.fixture

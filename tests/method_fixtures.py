@@ -1,4 +1,4 @@
-"""A short test sequence, and every method with networks that nobody trained."""
+"""A short test sequence, and every method with networks that nobody trained (fixture `checkpoints`)."""
 
 from pathlib import Path
 
@@ -73,10 +73,8 @@ def sequence(make_sequence):
     return make_sequence()
 
 
-@pytest.fixture(scope="session")
-def checkpoints(tmp_path_factory):
+def write_checkpoints(folder):
     """Networks that nobody trained, by section, in files as the training stages write them and as their authors did."""
-    folder = tmp_path_factory.mktemp("checkpoints")
     torch.manual_seed(0)
     metadata = {"network": "paper", "config": NETWORK, "in_channels": 4, "representation": "event_tensor"}
     files = {}

@@ -1,13 +1,13 @@
 import pytest
 import torch
-from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
+from method_fixtures import context, make_context, make_sequence, make_setup, sequence
 
 from polarnet.benchmark.sequences import BenchmarkSet
 from polarnet.events.stream import Events
 from polarnet.stokes import intensities_from_stokes, stokes_from_polarization
 from polarnet.storage import Contents, EventStore, FrameStore
 
-__all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
+__all__ = ["context", "make_context", "make_sequence", "make_setup", "sequence"]
 
 SCENES = {"t1": "photo", "a1": "lake", "a2": "lake", "b1": "wood", "c1": "town"}
 

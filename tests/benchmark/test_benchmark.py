@@ -7,7 +7,6 @@ import re
 
 import pytest
 import torch
-from method_fixtures import WITH_WEIGHTS_HERE
 
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.run import at_stored_precision, run_benchmark
@@ -21,9 +20,11 @@ from polarnet.storage.panels import read_panel
 
 pytestmark = pytest.mark.usefixtures("brief_costs")
 
+ROWS = ["zeros", "train_mean", "oracle_mean", "cf", "highpass+gain", "rotating_polarizer", "e2v", "e2p", "ours"]
+
 
 def config(**changes):
-    settings = BenchmarkConfig(WITH_WEIGHTS_HERE, ["simulated"], 1, "fp32", False, "alex", 50, 2)
+    settings = BenchmarkConfig(ROWS, ["simulated"], 1, "fp32", False, "alex", 50, 2)
     return dataclasses.replace(settings, **changes)
 
 
@@ -44,7 +45,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     returned = write_benchmark(folder, benchmark, config(), 1, {"lpips": {"backbone": None}, "train_mean": 0.25})
     metrics, costs = (json.loads((folder / f"{name}.json").read_text()) for name in ("metrics", "cost"))
     assert returned == {row: metrics[row] | costs[row] for row in metrics}
-    assert list(metrics) == list(costs) == WITH_WEIGHTS_HERE
+    assert list(metrics) == list(costs) == ROWS
     for row, scores in metrics.items():
         assert costs[row]["ms_per_window"] > 0
         assert not set(costs[row]) & set(scores)
@@ -62,7 +63,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert metrics["oracle_mean"]["mse"] < min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
     with (folder / "frames.csv").open() as file:
         lines = list(csv.DictReader(file))
-    assert len(lines) == len(WITH_WEIGHTS_HERE) * 4 * 3
+    assert len(lines) == len(ROWS) * 4 * 3
     assert {line["lpips"] for line in lines} == {""}
     details = json.loads((folder / "details.json").read_text())
     assert details["lpips"] == {"backbone": None}
@@ -70,7 +71,7 @@ def test_the_whole_benchmark_on_small_test_set(five_scenes, context, tmp_path):
     assert details["frames"] == 12
     assert "lpips" not in details["scene_means"]
     assert details["paired"]["cf"]["scenes"] == 3
-    assert set(details["paired"]) == set(WITH_WEIGHTS_HERE) - {"ours"}
+    assert set(details["paired"]) == set(ROWS) - {"ours"}
     assert set(details["scene_means"]["ssim"]["cf"]) == {"lake", "town", "wood"}
 
 

@@ -31,8 +31,8 @@ pytest.importorskip("h5py")
 
 NOTHING = Cleaning(None, 4.0, None)
 TINY = [
-    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=40",
-    "synthesize.sensor_width=56", "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10",
+    "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=32",
+    "synthesize.sensor_width=44", "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10",
     "benchmark.panel_scenes=1", "benchmark.lpips=false", "runtime.threads=1",
     "baselines.e2v.crop=null", "baselines.e2p.crop=null",
 ]  # fmt: skip
@@ -106,7 +106,7 @@ def test_events_and_frames_on_one_clock_agree_and_a_shift_is_found(recording):
 
 def test_unrelated_events_are_reported_and_frames_far_from_them_refused(recording, make_random_events, tmp_path):
     truth = read_truth(recording, MOSAIC)
-    noise = make_random_events(0, 20_000, int(truth.t_us[-1]), 80, 112)
+    noise = make_random_events(0, 20_000, int(truth.t_us[-1]), 64, 88)
     (note,) = clock_notes(truth.t_us, frame_lag(noise, truth))
     assert "whether they are on one clock is unknown" in note
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
@@ -133,7 +133,7 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     events, truth = read_recording(recording).events, read_truth(recording, MOSAIC)
     t = torch.arange(int(events.t[0]), int(events.t[-1]), 200)
     places = torch.full_like(t, 20).short()
-    hot = Events(t, places, places, torch.ones_like(t).to(torch.int8), 80, 112)
+    hot = Events(t, places, places, torch.ones_like(t).to(torch.int8), 64, 88)
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
     (tmp_path / "in").mkdir()
     write_e2p(tmp_path / "in" / "hot.h5", merge([events, hot]), truth.t_us, levels, None)

@@ -1,3 +1,3 @@
-from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
+from method_fixtures import context, make_context, make_sequence, make_setup, sequence
 
-__all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
+__all__ = ["context", "make_context", "make_sequence", "make_setup", "sequence"]

@@ -96,14 +96,15 @@ def test_a_whole_recording_gives_better_maps_than_the_past_alone(simulated, wind
     assert errors["registered"] < 0.9 * errors["ours"]
 
 
+@pytest.mark.thorough
 def test_the_next_block_is_registered_with_the_windows_before_it(windows, open_shipped):
     recoverer = open_shipped("registered")
-    state, _ = recoverer.step(recoverer.start(120, 180), windows[:20])
-    kept, latest = recoverer.step(state, windows[20:])
+    state, _ = recoverer.step(recoverer.start(120, 180), windows[:12])
+    kept, latest = recoverer.step(state, windows[12:18])
     assert len(kept.counts) == REGISTRATION.overlap
-    again = recoverer.step(state, windows[20:])[1]
+    again = recoverer.step(state, windows[12:18])[1]
     assert torch.equal(latest.dolp, again.dolp)  # the state before has not changed
-    alone = recoverer.step(recoverer.start(120, 180)._replace(inner=state.inner), windows[20:])[1]
+    alone = recoverer.step(recoverer.start(120, 180)._replace(inner=state.inner), windows[12:18])[1]
     assert not torch.equal(latest.dolp, alone.dolp)
 
 

@@ -56,7 +56,10 @@ def save_small(name: str, folder: Path) -> Path:
     return folder / f"{name}.safetensors"
 
 
-@pytest.fixture(scope="module", params=["paper", "polarnet"])
+POLARNET_IS_SLOW = pytest.param("polarnet", marks=pytest.mark.thorough)
+
+
+@pytest.fixture(scope="module", params=["paper", POLARNET_IS_SLOW])
 def written(request, tmp_path_factory) -> Written:
     """Tracing takes seconds, so each network is written once, without the shape checks, which make it slower."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -164,7 +167,7 @@ def test_without_the_packages_the_extra_is_named(tmp_path, monkeypatch, capsys):
         assert f"ONNX files need {absent}: run pip install -e '.[export]' in the clone" in said
 
 
-@pytest.mark.parametrize("written", ["polarnet"], indirect=True)
+@pytest.mark.parametrize("written", [POLARNET_IS_SLOW], indirect=True)
 def test_the_lines_on_the_page_run_as_they_stand(written, monkeypatch, project_root):
     monkeypatch.chdir(written.path.parent)
     snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)

@@ -114,6 +114,7 @@ def test_without_h5py_the_error_names_the_extra(make_events, tmp_path, monkeypat
         write_hdf5(tmp_path / "e.h5", make_events([], 1, 1), 1000)
 
 
+@pytest.mark.thorough
 def test_hdf5_on_a_full_disk_ends_with_the_error_of_the_disk_and_the_process_goes_on(tmp_path):
     """HDF5 itself crashes then, once its objects are released."""
     script = f"""

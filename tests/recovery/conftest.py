@@ -2,12 +2,9 @@
 
 import pytest
 from event_fixtures import events_of, random_events
-from method_fixtures import checkpoints
 
 from polarnet.events.stream import merge
 from polarnet.storage.events import EventStore
-
-__all__ = ["checkpoints"]
 
 HEIGHT, WIDTH, DURATION_US = 16, 20, 100_000
 

@@ -145,7 +145,7 @@ def test_the_number_of_events_under_v2e_settings_agrees_over_seeds(golden, descr
 def test_shot_noise_has_equal_polarities_and_the_rate_that_v2e_showed(described, model, dn):
     measured = described["noise_statistics"][f"shot5_DN{dn}"]
     config = dataclasses.replace(CONFIG, model=model, shot_noise_rate_hz=5.0)
-    frames = torch.full((1, 1, 64, 64), dn, dtype=torch.uint8).expand(601, -1, -1, -1)
+    frames = torch.full((1, 1, 64, 64), float(dn)).expand(601, -1, -1, -1)
     (events,), _ = emulate(frames, torch.arange(601, dtype=torch.float64) * 1e6 / 300, config, key=2)
     error = math.sqrt(measured["model"] / (2 * 64 * 64))  # of a Poisson count over two seconds
     assert len(events) / (2 * 64 * 64) == pytest.approx(measured["model"], abs=3 * error)

@@ -1,9 +1,7 @@
 """Videos that browsers play, whole or after a kill."""
 
-import os
 import signal
-import subprocess
-import sys
+from multiprocessing import Pipe, get_context
 
 import av
 import numpy as np
@@ -41,20 +39,20 @@ def test_pictures_come_back_at_their_rate_with_even_sides_and_have_one_size(tmp_
 
 
 def test_after_a_kill_the_complete_fragments_play(tmp_path):
-    script = """
-import sys, time, numpy as np
-from pathlib import Path
-from polarnet.reports.preview import VideoWriter
-video = VideoWriter(Path(sys.argv[1]), 10.0)
-for level in range(100):
-    video.add(np.full((64, 96, 3), level, np.uint8))
-print("written", flush=True)
-time.sleep(60)
-"""
-    command = [sys.executable, "-c", script, str(tmp_path / "a.mp4")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-        process.stdout.readline()
-        os.kill(process.pid, signal.SIGKILL)
+    written, sender = Pipe(duplex=False)
+    process = get_context("fork").Process(target=write_and_wait, args=(tmp_path / "a.mp4", sender))
+    process.start()
+    assert written.poll(60), "the process writes nothing"
+    process.kill()
+    process.join()
     played = levels(tmp_path / "a.mp4")
     assert 40 <= len(played) < 100  # the encoder and the last fragment, of 2 s, are lost
     np.testing.assert_allclose(played, range(len(played)), atol=2)
+
+
+def write_and_wait(path, sender):
+    video = VideoWriter(path, 10.0)
+    for level in range(100):
+        video.add(grey(level))
+    sender.send(True)
+    signal.pause()

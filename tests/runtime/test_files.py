@@ -4,9 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+from multiprocessing import get_context
 
 import pytest
-from preloaded import FORKSERVER
 
 from polarnet.runtime import files
 from polarnet.runtime.files import SUMS, changed_files, check_name, check_seal, claimed, publish, replaced, seal, sha256
@@ -117,7 +117,7 @@ def test_a_temporary_file_that_is_a_link_changes_no_file_elsewhere_and_two_do_no
     (tmp_path / "file.tmp").symlink_to(tmp_path / "victim")
     with replaced(tmp_path / "file") as temporary:
         temporary.write_text("new")
-        second = FORKSERVER.Process(target=replace, args=(tmp_path / "file",))
+        second = get_context("fork").Process(target=replace, args=(tmp_path / "file",))
         second.start()
         second.join()
         assert second.exitcode == 1

@@ -85,6 +85,7 @@ print(json.dumps(state))
 """
 
 
+@pytest.mark.thorough
 def test_importing_every_module_changes_no_variable_no_file_and_no_mode():
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMP", "GOMP"))}
     command = [sys.executable, "-c", IMPORT_EVERYTHING]

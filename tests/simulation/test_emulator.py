@@ -111,7 +111,13 @@ def test_pieces_threads_and_the_order_of_channels_change_no_event(model, share):
     assert all(map(equal, turned[::-1], whole))
 
 
-@pytest.mark.parametrize("model", list(MODELS))
+ONLY_HERE = ("exact", "dvs_voltmeter")
+"""Models whose kernels for bytes no other test compiles, which takes seconds."""
+
+
+@pytest.mark.parametrize(
+    "model", [pytest.param(model, marks=[pytest.mark.thorough] * (model in ONLY_HERE)) for model in MODELS]
+)
 def test_whole_numbers_mean_the_same_as_bytes_and_as_floats(model):
     t_us = 3333 * torch.arange(12)
     from_bytes, _ = emulate(moving_bars().byte(), t_us, of(model, NOISY), key=3)

@@ -227,7 +227,6 @@ def test_whichever_rename_a_writer_dies_before_the_rerun_ends_with_the_same_byte
         write_two_parts()
         assert files_of(path) == expected
         assert [entry.name for entry in tmp_path.iterdir()] == ["store.zarr"]
-    gc.unfreeze()
     assert deaths > 6
 
 

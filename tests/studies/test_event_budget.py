@@ -1,6 +1,6 @@
 import pytest
 import torch
-from method_fixtures import checkpoints, context, make_context, make_sequence, make_setup, sequence
+from method_fixtures import context, make_context, make_sequence, make_setup, sequence
 
 from polarnet.benchmark.rows import opened
 from polarnet.methods import METHODS
@@ -16,7 +16,7 @@ from studies.event_budget import (
     windows_of_figure_11,
 )
 
-__all__ = ["checkpoints", "context", "make_context", "make_sequence", "make_setup", "sequence"]
+__all__ = ["context", "make_context", "make_sequence", "make_setup", "sequence"]
 
 
 def test_events_per_pixel_is_the_mean_over_channels_before_each_time(sequence):

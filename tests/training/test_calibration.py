@@ -92,7 +92,7 @@ def test_weighted_sequences_are_polarized_like_the_scenes_that_errors_are_expect
     assert share_below(0.13) == pytest.approx(0.9, abs=0.02)
 
 
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("precision", ["fp32", pytest.param("bf16", marks=pytest.mark.thorough)])
 def test_errors_are_expected_where_they_are_and_dolp_is_what_it_was(stores, task_of, precision):
     task, config = task_of(), dataclasses.replace(TRAIN, precision=precision)
     torch.nn.init.normal_(task.network.add.weight, std=0.1, generator=torch.Generator().manual_seed(1))
@@ -136,8 +136,15 @@ def test_it_rests_on_variants_only_if_the_scenes_it_is_for_are_named(stores, tmp
     assert calibrate(task, sequences_to_fit(task, train), TRAIN, CPU, 0)["sequences"] == sequences
 
 
-def test_a_training_starts_from_the_weights_of_another_but_not_from_its_expected_errors(stores, tmp_path, task_of):
+def test_a_training_shows_its_progress_and_another_starts_from_its_weights_but_not_from_its_expected_errors(
+    stores, tmp_path, task_of, progress_log
+):
     run(task_of(), stores, tmp_path / "run", TRAIN)
+    lines = progress_log()
+    for start in ("epoch 1/2", "epoch 2/2", "validation", "expected errors"):
+        shown = [line for line in lines if line.startswith(f"{start}: 100%")]
+        assert shown, lines
+        assert all(("loss=" in line) == start.startswith("epoch") for line in shown)
     start = tmp_path / "run" / "out" / "best.safetensors"
     tensors, _ = load_checkpoint(start)
     begun = task_of(str(start)).network.state_dict()
@@ -158,12 +165,3 @@ def test_a_training_ends_with_it_even_if_killed_before(stores, tmp_path, task_of
     _, metadata = load_network(tmp_path / "whole" / "out" / "best.safetensors")
     assert metadata["expected_errors"] == said
     assert "expected_errors" not in json.loads(whole["last.json"])
-
-
-def test_a_log_shows_the_progress_of_training_validation_and_expected_errors(stores, task_of, tmp_path, progress_log):
-    run(task_of(), stores, tmp_path, TRAIN)
-    lines = progress_log()
-    for start in ("epoch 1/2", "epoch 2/2", "validation", "expected errors"):
-        shown = [line for line in lines if line.startswith(f"{start}: 100%")]
-        assert shown, lines
-        assert all(("loss=" in line) == start.startswith("epoch") for line in shown)

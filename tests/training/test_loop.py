@@ -16,7 +16,6 @@ from polarnet.networks.e2v.firenet import FireNet
 from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import load_network
 from polarnet.runtime.files import SUMS
-from polarnet.runtime.machine import precision_on
 from polarnet.storage.events import EventStore
 from polarnet.training.dolp import dolp_task
 from polarnet.training.e2v import E2vConfig, e2v_task
@@ -103,8 +102,9 @@ def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path, config:
         run(dataclasses.replace(task, unroll=unroll), stores, folder, config)
 
 
-@pytest.mark.parametrize("killed_at", [8, 9, 12])  # each of two epochs has eight steps, validation included
+@pytest.mark.parametrize("killed_at", [*(pytest.param(step, marks=pytest.mark.thorough) for step in (8, 9)), 12])
 def test_a_training_killed_at_any_step_ends_as_if_undisturbed(stores, tmp_path, undisturbed, killed_at):
+    """Each of two epochs has eight steps, validation included."""
     killed(small_task(), killed_at, stores, tmp_path)
     assert files_of(run(small_task(), stores, tmp_path)) == undisturbed
 
@@ -185,15 +185,15 @@ def test_the_e2v_baseline_learns_each_polarizers_intensity_from_its_own_events(s
     assert torch.equal(task.streams(masked)[2], masked.valid.repeat_interleave(4, dim=1))  # four channels of each
 
 
-@pytest.mark.parametrize("precision", ["bf16", "auto"])
-def test_other_precisions_train_as_well_and_are_named(stores, tmp_path, precision):
+def test_automatic_precision_trains_in_bfloat16_where_there_are_units_and_names_it(stores, tmp_path, monkeypatch):
+    monkeypatch.setattr("polarnet.runtime.machine.bf16_units", lambda device: ["AMX"])
     task = small_task()
     before = {name: tensor.clone() for name, tensor in task.network.state_dict().items()}
-    out = run(task, stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, visits=1, precision=precision))
+    out = run(task, stores, tmp_path, dataclasses.replace(TRAIN, epochs=1, visits=1, precision="auto"))
     after = task.network.state_dict()
     assert all(tensor.dtype == torch.float32 and tensor.isfinite().all() for tensor in after.values())
     assert any(not torch.equal(after[name], before[name]) for name in before)
-    assert load_checkpoint(out / "last.safetensors")[1]["training"]["precision"] == precision_on(CPU, precision)
+    assert load_checkpoint(out / "last.safetensors")[1]["training"]["precision"] == "bf16"
 
 
 def test_a_loss_that_is_not_a_number_stops_the_training(stores, tmp_path):

@@ -1,5 +1,6 @@
+from multiprocessing import get_context
+
 import pytest
-from preloaded import FORKSERVER
 from ruamel.yaml import YAML
 
 from polarnet.runtime.files import seal
@@ -8,7 +9,8 @@ from polarnet.training.engine.recorder import HISTORY, Recorder, best_row, read_
 
 @pytest.mark.parametrize(("out", "seed", "named"), [("out", 2, "out"), ("other", 1, r"resume/\w{16}")])
 def test_a_training_with_the_output_folder_of_another_or_equal_to_it_is_refused(tmp_path, out, seed, named):
-    first = FORKSERVER.Process(target=hold, args=(tmp_path, ready := FORKSERVER.Event(), end := FORKSERVER.Event()))
+    fork = get_context("fork")
+    first = fork.Process(target=hold, args=(tmp_path, ready := fork.Event(), end := fork.Event()))
     first.start()
     assert ready.wait(60)
     with pytest.raises(ValueError, match=rf"{named}: another process is writing it"):

@@ -1,3 +1,0 @@
-from method_fixtures import checkpoints
-
-__all__ = ["checkpoints"]
