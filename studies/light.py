@@ -20,10 +20,9 @@ from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.sequence import simulate
+from studies.simulation_pictures import QUIET
 from studies.study import arguments_of, command_line, machine_record, write_section
 
-QUIET = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
-"""Pixels without noise and mismatch."""
 RESPONSES: dict[str, dict[str, Any]] = {
     "exact, v2e's response": {"model": "exact"},
     "exact, dark_dn 20": {"model": "exact", "dark_dn": 20.0},

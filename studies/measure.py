@@ -1,11 +1,11 @@
-"""Figures of the pipeline, and the pictures of the demo: python -m studies.measure
+"""Figures of the pipeline, and the pictures of docs: python -m studies.measure
 
     [--pipeline] [--run NAME DATA] [--pictures]
 
 --pipeline times the demo in a fresh clone (docs/results/pipeline.json). --run reads the simulated test set of a run of
 the pipeline in the folder DATA: `paper` of experiment=paper_small, `benchmark` of experiment=photographs with the rows
-of the table. --pictures draws those of the demo. The tree must be committed, because figures name a commit. Every
-other study is a command of its own.
+of the table. --pictures draws those that show nothing but the simulation, the shipped weights and the demo. The tree
+must be committed, because figures name a commit. Every other study is a command of its own.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Any
 import av
 from PIL import Image
 
-from studies.rig import COLOURS
+from studies.simulation_pictures import COLOURS
 from studies.study import (
     PICTURES,
     ROOT,
@@ -79,7 +79,9 @@ def measure_run(name: str, data: Path, root: Path = ROOT) -> Path:
 
 
 def draw_pictures() -> None:
-    """Draw the pictures of the demo."""
+    """Draw the pictures that show nothing but the simulation and the demo."""
+    for module in ("simulation_pictures", "physics_pictures"):
+        subprocess.run([sys.executable, "-m", f"studies.{module}"], cwd=ROOT, check=True)
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "polarnet.cli", "demo", "--out", folder], cwd=ROOT, check=True)
         with Image.open(Path(folder, "simulated", "preview.png")) as preview:

@@ -4,14 +4,12 @@ The eight captures of a photograph are written as CeleX-5 files with random dela
 calibrated as in the stage.
 """
 
-import io
 import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from PIL import Image
 from skimage import data
 
 from polarnet.captures.dot import EVENT_CAPTURES, read_event_capture
@@ -25,6 +23,7 @@ from polarnet.recordings.writers import write_hdf5
 from polarnet.reports.recordings import draw_calibration, recording_picture
 from polarnet.simulation.scene import scene_from_rgb
 from studies.simulated_rig import RigConfig, write_rig
+from studies.simulation_pictures import few_colours
 from studies.study import PICTURES, ROOT
 
 RIG = RigConfig(
@@ -37,15 +36,6 @@ RIG = RigConfig(
     hot_pixels=5,
 )
 CUTOFF_HZ = 3000.0  # of the photoreceptor; a low one adds a delay
-COLOURS = 96  # palette size of a picture on disk
-
-
-def few_colours(content: bytes) -> bytes:
-    """Reduce a picture to a palette: a third of the bytes, without a visible difference."""
-    buffer = io.BytesIO()
-    picture = Image.open(io.BytesIO(content)).convert("RGB")
-    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(buffer, format="png", optimize=True)
-    return buffer.getvalue()
 
 
 def main() -> None:

@@ -3,22 +3,25 @@
 import pytest
 
 from polarnet.simulation.presets import SENSORS
+from studies import physics_pictures, simulation_pictures
 from studies.camera import FINE, analyzer_errors
 
 
-def test_every_picture_is_shown_and_together_they_stay_small(project_root):
+@pytest.mark.parametrize("name", [*simulation_pictures.FIGURES, *physics_pictures.FIGURES])
+def test_a_picture_lies_beside_the_page_that_shows_it(project_root, name):
+    assert any(f"pictures/{name}.png" in page.read_text() for page in (project_root / "docs").glob("*.md"))
+    assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000
+
+
+def test_the_pictures_together_stay_small(project_root):
     """Every version of them stays in the history."""
-    pages = "".join(page.read_text() for page in (project_root / "docs").glob("*.md"))
-    pictures = [*(project_root / "docs" / "pictures").iterdir()]
-    assert [path.name for path in pictures if f"pictures/{path.name}" not in pages] == []
-    assert sum(path.stat().st_size for path in pictures) < 1_100_000
+    assert sum(path.stat().st_size for path in (project_root / "docs" / "pictures").iterdir()) < 1_100_000
 
 
 def test_a_dofp_sensor_is_calibrated_from_its_own_events_to_1_percent():
     assert analyzer_errors(FINE, seed=2).abs().max() < 0.01
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1, 2])
 def test_with_the_noise_mismatch_and_thresholds_of_the_default_sensor_it_is_calibrated_to_1_percent_rms(seed):
     errors = analyzer_errors(SENSORS["default"], seed)
