@@ -80,7 +80,7 @@ def measure_run(name: str, data: Path, root: Path = ROOT) -> Path:
 
 def draw_pictures() -> None:
     """Draw the pictures that show nothing but the simulation and the demo."""
-    for module in ("simulation_pictures", "physics_pictures"):
+    for module in ("overview", "simulation_pictures", "physics_pictures"):
         subprocess.run([sys.executable, "-m", f"studies.{module}"], cwd=ROOT, check=True)
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "polarnet.cli", "demo", "--out", folder], cwd=ROOT, check=True)

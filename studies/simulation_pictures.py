@@ -174,15 +174,18 @@ FIGURES = {
 
 
 def write_pictures(
-    figures: Mapping[str, Callable[[], Figure]], about: str, encode: Callable[[bytes], bytes] = few_colours
+    figures: Mapping[str, Callable[[], Figure]],
+    about: str,
+    encode: Callable[[bytes], bytes] = few_colours,
+    suffix: str = "png",
 ) -> None:
-    """Command line of a module of pictures: write every figure as NAME.png, encoded from PNG, into a folder."""
+    """Command line of a module of pictures: write every figure as NAME.SUFFIX, encoded from PNG, into a folder."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("folder", type=Path, nargs="?", default=PICTURES, help="default: that of docs")
     folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        path = folder / f"{name}.png"
+        path = folder / f"{name}.{suffix}"
         path.write_bytes(encode(png(figure())))
         print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
 
