@@ -28,11 +28,14 @@ ROOT = Path(__file__).resolve().parents[1]
 MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
 KEYS = {"file", "section", "rows", "without", "columns", "caption"}
 
+ROOT_OF = "rms"
+"""Before a format: the square root of the value, such as {mse:rms.2f}."""
+
 Results = Mapping[str, Any]
 
 
 class Value:
-    """A value as a format string prints it: "-" if missing; lists and mappings are joined by commas."""
+    """A value as a format string prints it: "-" if missing; lists and mappings are joined by commas; RMS of an MSE."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -50,6 +53,8 @@ class Value:
             return ", ".join(format(Value(one), form) for one in value)
         if value is None:
             return "-"
+        if form.startswith(ROOT_OF):
+            return format(value**0.5, form.removeprefix(ROOT_OF))
         return str(value).lower() if isinstance(value, bool) else format(value, form)
 
     def __str__(self) -> str:

@@ -126,16 +126,16 @@ def _fit(
 ) -> Float64[np.ndarray, "3 count"]:
     """b / a, c / a and the number of events of each pixel, from events in time order."""
     level = np.zeros(count)  # sum of a pixel's steps since its first event
-    sums = np.zeros((count, 9))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and y w (cos, sin, 1); y w = 1 / y
+    sums = np.zeros((count, 9))  # sums of w (1, cos, sin, cos cos, cos sin, sin sin) and 1 / y (cos, sin, 1)
     fitted = np.zeros((3, count))
     for k in range(len(pixel)):
         i, c, s = pixel[k], cos[k], sin[k]
         if fitted[2, i] > 0:
             level[i] += step[k]
         fitted[2, i] += 1
-        y = math.exp(-level[i])
-        w = y * y
-        for j, term in enumerate((w, w * c, w * s, w * c * c, w * c * s, w * s * s, y * c, y * s, y)):
+        inverse = math.exp(-level[i])  # 1 / y
+        w = inverse * inverse
+        for j, term in enumerate((w, w * c, w * s, w * c * c, w * c * s, w * s * s, inverse * c, inverse * s, inverse)):
             sums[i, j] += term
     for i in range(count):
         if fitted[2, i] < MIN_EVENTS:

@@ -37,7 +37,7 @@ class Truth(NamedTuple):
     dolp: Float[Tensor, "n h w"]
     aolp: Float[Tensor, "n h w"]
     valid: Bool[Tensor, "n h w"]
-    """False where pixels are saturated, and on the rim of demosaicked frames."""
+    """False where pixels are saturated, and in demosaicked frames on the rim and without light."""
     light: Float32[np.ndarray, "n 2*h 2*w"]
     """Light behind each pixel's own polarizer; 1 at saturation."""
 
@@ -90,5 +90,6 @@ def _demosaicked(frames: CameraFrames, mosaic: Mosaic) -> Truth:
         intensity[k, :, 1:-1, 1:-1] = torch.from_numpy(without_saturation(values, saturated))
         valid[k, 1:-1, 1:-1] = torch.from_numpy(saturated.sum(axis=0) <= 1)
     stokes = stokes_from_intensities(intensity)
+    valid &= stokes[:, 0] > 0  # without light there is no polarization
     light = levels.astype(np.float32) / np.float32(white)
     return Truth(frames.t_us, intensity.float(), dolp(stokes).clamp(0, 1).float(), aolp(stokes).float(), valid, light)

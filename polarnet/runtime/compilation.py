@@ -12,8 +12,8 @@ import numba
 import numpy as np
 
 _RUNNING = threading.Lock()
-ZERO, ONE = np.int64(0), np.int64(1)
-"""0 and 1 as int64 arguments of kernels: numba would compile a kernel once for a literal and once more for int64."""
+ZERO = np.int64(0)
+"""0 as an int64 argument of kernels: numba would compile a kernel once for a literal and once more for int64."""
 
 
 def compiled(kernel: Callable, **options: Any) -> Any:

@@ -112,4 +112,4 @@ def test_the_best_method_and_constant_of_the_readme_are_the_best(project_root, s
     block = read_tables(project_root)["abilities"]["caption"]
     for best, others in ((method, ("highpass+gain", "firenet_published+gain")), (constant, CONSTANTS)):
         assert min(others, key=lambda row: rows[row]["mse"]) == best
-        assert f"{{test[tables][{scenes}][rows][{best}][mse]:.4f}}" in block
+        assert f"{{test[tables][{scenes}][rows][{best}][mse]:rms.2f}}" in block

@@ -148,7 +148,7 @@ def _order_of(lines: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
 
 
 def _in_seconds(path: Path, start: int, place: int) -> bool:
-    """Whether times are in seconds: one of the first different ones has a fraction, or all are whole with a point."""
+    """Whether times are in seconds: one of the first different ones has a fraction, or they are few and have a point."""
     times: dict[float, bytes] = {}
     with unpacked(path) as file:
         file.seek(start)
@@ -156,9 +156,10 @@ def _in_seconds(path: Path, start: int, place: int) -> bool:
             word = words[place] if len(words := words_of(line)) == len(COLUMNS) else b""
             if word.isalpha() or not _NUMBER.fullmatch(word) or not abs(float(word)) < _MAX_VALUE:
                 continue
-            times.setdefault(float(word), word)
-            if not float(word).is_integer() or len(times) == TELLING_TIMES:
-                return not float(word).is_integer()
+            time = float(word)
+            times.setdefault(time, word)
+            if not time.is_integer() or len(times) == TELLING_TIMES:
+                return not time.is_integer()
     return any(b"." in word and b"e" not in word.lower() for word in times.values())
 
 
