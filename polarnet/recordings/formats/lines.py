@@ -148,7 +148,7 @@ def _order_of(lines: Sequence[Sequence[str]]) -> tuple[str, ...] | None:
 
 
 def _in_seconds(path: Path, start: int, place: int) -> bool:
-    """Whether times are in seconds: one of the first different ones has a fraction, or they are few and have a point."""
+    """Whether times are in seconds: an early one has a fraction, or they are few and one has a point."""
     times: dict[float, bytes] = {}
     with unpacked(path) as file:
         file.seek(start)
