@@ -274,11 +274,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
         "--truth", nargs="?", type=input_name, const=BESIDE, metavar="FRAMES",
         help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
     )  # fmt: skip
-    add(
-        "--frames",
-        action="store_true",
-        help="use the frames of a camera with --mosaic too (AEDAT-2, AEDAT4, E2P's HDF5)",
-    )
+    add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")

@@ -25,7 +25,7 @@ from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
 from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames
+from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import METADATA, unknown_sequence
 
@@ -92,8 +92,8 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
     first = next(iter(reader), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
-    s1, s2 = truth.dolp * torch.cos(2 * truth.aolp), truth.dolp * torch.sin(2 * truth.aolp)
-    return StokesFrames(truth.t_us, torch.stack([s1, s2], dim=1), truth.valid).since(int(first.t[0]))
+    stokes = stokes_from_polarization(torch.ones_like(truth.dolp), truth.dolp, truth.aolp)[:, 1:]
+    return StokesFrames(truth.t_us, stokes, truth.valid).since(int(first.t[0]))
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
