@@ -64,6 +64,8 @@ ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_publishe
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
 FRAMES_HZ = (1, 5, 20)  # of the camera
+BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`recover --step`), and of the camera's
+BETWEEN_US = 12_500  # time between those that are scored, every 25th
 EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
 FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
@@ -164,6 +166,8 @@ def scored_sequence(
     warmup = warmup_windows(config)
     scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
+    if mode == FRAMES:
+        scores += score_sequence(*between_windows(scenes, test, first_context, first), 0, None, torch.device("cpu"))
     valid = None if test.valid is None else test.valid[first:]
     errors = {
         row: reliability(one.log_variance[first:], one.dolp[first:], test.dolp[first:], valid)
@@ -187,6 +191,26 @@ def with_frames(scenes: SceneStore, test: TestSequence, context: Context) -> dic
         aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
         predictions[f"nearest of {rate_hz} frames/s"] = Prediction(torch.hypot(s1, s2).clamp(max=1), aolp)
     return predictions
+
+
+def between_windows(
+    scenes: SceneStore, test: TestSequence, context: Context, first: int
+) -> tuple[TestSequence, dict[str, Prediction]]:
+    """Frames of `registered` with the camera's frames at times between windows, from window `first` on; their truth."""
+    frames = camera_frames(scenes, test.name, int(test.t_us[-1]), BETWEEN_FRAMES_HZ)
+    recoverer = METHODS[WHOLE].open(replace(context.setups[METHODS[WHOLE].section], frames=frames))
+    windows = test.windows_for(False)
+    state, _ = recoverer.step(recoverer.start(*test.dolp.shape[-2:]), windows)
+    t_us = np.arange(windows[first].start_us, windows[-1].stop_us, BETWEEN_US) // (10**6 // BETWEEN_HZ)
+    t_us = t_us[1:] * (10**6 // BETWEEN_HZ)
+    truth = sequence_at(scenes, test.name, test.events, torch.from_numpy(np.concatenate([[0], t_us])))
+    assert recoverer.between is not None
+    return truth, {between_row(): recoverer.between(state, t_us)}
+
+
+def between_row() -> str:
+    """Name of the row of frames between windows."""
+    return f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s, at {BETWEEN_HZ} Hz"
 
 
 def camera_frames(scenes: SceneStore, name: str, stop_us: int, rate_hz: float) -> StokesFrames:
@@ -346,7 +370,9 @@ def main() -> None:
     tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, mode)
     if mode == FRAMES:
         rows = tables["measured"]["rows"]
-        figures = {FRAMES: {"mse_over_events_only": rows[f"{WHOLE}, 5 frames/s"]["mse"] / rows[OURS]["mse"]}}
+        with_5, at_rate = rows[f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"], rows[between_row()]
+        ratio, change = with_5["mse"] / rows[OURS]["mse"], at_rate["psnr"] - with_5["psnr"]
+        figures = {FRAMES: {"mse_over_events_only": ratio, f"psnr_change_at_{BETWEEN_HZ}_hz": change}}
     else:
         figures = {mode: headlines(tables, WHOLE)} if mode else headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))

@@ -286,7 +286,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add(
         "--method",
         help="registered (the network over a whole recording, the default), ours (the network from window to window, "
-        "the default of --live and --step), or another method of the benchmark: cf, highpass, cf+gain, e2v, ...",
+        "the default of --live), or another method of the benchmark: cf, highpass, cf+gain, e2v, ...",
     )
     add("--weights", type=input_path, metavar="FILE", help="checkpoint of the method (default: the shipped one)")
     add(

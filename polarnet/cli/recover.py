@@ -52,7 +52,7 @@ NOT_ROTATING = (
     *CLEANING,
 )  # fmt: skip
 """Options without a meaning for live input, and for one camera behind a rotating polarizer."""
-NOT_WITH_FRAMES = ("size", "step")
+NOT_WITH_FRAMES = ("size",)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -109,8 +109,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Setup]) -> str:
-    """The network over the whole recording, or from window to window: live, overlapping, or with another network."""
-    if options.live or options.step:
+    """The network over the whole recording, or from window to window: live, or with another network."""
+    if options.live:
         return PAST_METHOD
     whole = METHODS[WHOLE_METHOD]
     other = options.weights and why_absent(whole, replace(setup_of(whole), weights=options.weights))

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import torch
+from jaxtyping import Int64
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
@@ -105,6 +107,9 @@ class Recoverer(NamedTuple):
 
     sees_ahead: bool = False
     """Whether the frames of a run also depend on its later windows; runs should then be as long as `at_once` says."""
+    between: Callable[[State, Int64[np.ndarray, " n"]], Prediction] | None = None
+    """State after a run and n times within its windows, in microseconds -> the maps at these times. None if the method
+    has frames at the ends of its windows alone: windows must overlap for a higher rate."""
 
     @torch.no_grad()
     def step(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:

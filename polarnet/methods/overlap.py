@@ -87,7 +87,7 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
             return Recent(history, ()), prediction
         frames = []
         for window in windows:
-            parts, recent = _parts(window, trained_us), _recent(state.windows, window, trained_us)
+            parts, recent = equal_parts(window, trained_us), _recent(state.windows, window, trained_us)
             if len(parts) == 1:
                 channels = [concatenate(of_one) for of_one in zip(*(one.channels for one in recent), strict=True)]
                 parts = [EventWindow(channels, recent[0].start_us, window.stop_us)]
@@ -110,9 +110,9 @@ def _recent(before: Sequence[EventWindow], window: EventWindow, trained_us: int)
     return tuple(last)
 
 
-def _parts(window: EventWindow, trained_us: int) -> list[EventWindow]:
-    """Cut a window into equal parts of about `trained_us`."""
-    number = max(1, round(window.length_us / trained_us))
+def equal_parts(window: EventWindow, part_us: int) -> list[EventWindow]:
+    """Cut a window into equal parts of about `part_us`."""
+    number = max(1, round(window.length_us / part_us))
     ends = [window.start_us + round(k * window.length_us / number) for k in range(number + 1)]
     return [
         EventWindow([slice_time(events, start, stop) for events in window.channels], start, stop)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from polarnet.events.rotation import Rotation
@@ -24,7 +25,7 @@ from polarnet.events.streaming import (
 )
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
-from polarnet.methods.overlap import advance, begin, warm_up
+from polarnet.methods.overlap import advance, begin, equal_parts, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Piece
@@ -148,6 +149,9 @@ def _framed() -> list[str]:
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
     """Yield a frame for each window, of live input as soon as the window's last event has arrived.
 
+    If the rule has a step and the method has frames between the ends of its windows, windows follow each other, and
+    each is cut into equal parts of about that step, with a frame at the end of each part.
+
     Another thread reads the input ahead. Windows that are already available, such as those of a file, are processed in
     runs of up to `at_once` windows (default: `Recoverer.at_once`). If a live source does not wait and the processor is
     too slow for it, the windows that have arrived are joined to one. ValueError if no window is complete.
@@ -158,7 +162,9 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
         )
     with said_after(PATIENCE_S, "preparing the network; the first run on a machine also compiles its kernels"):
         warm_up(recoverer, source.height, source.width, source.channels)
-    cutter = WindowCutter(rule, source.height, source.width, source.channels)
+    part_us = rule.step_us if recoverer.between else None
+    windows_of = replace(rule, step_us=None) if part_us else rule
+    cutter = WindowCutter(windows_of, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
     most = at_once or recoverer.at_once(source.height, source.width)
     arrived: deque[float] = deque()  # when the last events of the windows that have no frame yet came
@@ -180,11 +186,16 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
             maps = each_map(prediction, Tensor.cpu)
             done = time.perf_counter()
             for k, window in enumerate(run):
-                frame = each_map(maps, operator.itemgetter(k))
-                _check_finite(frame, window)
-                number += 1
                 came = [arrived.popleft() for _ in range(window.joined)][-1]
-                yield Frame(window, frame, (done - start) / len(run), done - came)
+                parts, of_parts = [window], each_map(maps, operator.itemgetter(slice(k, k + 1)))
+                if part_us and recoverer.between:
+                    parts = equal_parts(window, part_us)
+                    of_parts = recoverer.between(history[-1][1], np.array([part.stop_us for part in parts]))
+                for n, part in enumerate(parts):
+                    frame = each_map(of_parts, operator.itemgetter(n))
+                    _check_finite(frame, part)
+                    number += 1
+                    yield Frame(part, frame, (done - start) / len(run) / len(parts), done - came)
     if not number:
         raise ValueError(_too_short(source, rule, until_us))
 

@@ -160,10 +160,14 @@ def test_recover_takes_the_frames_of_the_camera_and_says_where_it_cannot(recordi
         errors[out] = np.square(found - dolp[1 : 1 + len(found)]).mean()
     assert errors["frames"] < 0.2 * errors["events"]
     assert f"with {len(dolp)} frames of the camera" in capsys.readouterr().out
+    assert run(*mosaic, "--frames", "--step", "1ms", out="steps") == 0
+    ends, steps = (zarr.open_group(tmp_path / out / "recovered.zarr", mode="r") for out in ("frames", "steps"))
+    assert 990 <= np.diff(steps["t_us"]).min() <= np.diff(steps["t_us"]).max() <= 1020
+    same = np.isin(steps["t_us"], ends["t_us"])
+    np.testing.assert_array_equal(steps["dolp"][:][same], ends["dolp"][:])
     for more, reason in (
         ([], "--frames: expected --mosaic"),
         ([*mosaic, "--method", "cf"], "--frames is for --method registered, cf does not use them"),
-        ([*mosaic, "--step", "1ms"], "--frames: expected no --step"),
     ):
         assert run("--frames", *more) == 1
         assert reason in capsys.readouterr().err

@@ -149,6 +149,23 @@ def test_what_frames_show_is_carried_along_the_motion_and_frames_of_another_time
     assert maps["frames"].log_variance.exp().mean() < 0.5 * maps["none"].log_variance.exp().mean()
 
 
+@pytest.mark.parametrize("with_frames", [False, True])
+def test_maps_between_the_ends_of_windows_are_as_good_as_those_at_the_ends(simulated, open_shipped, with_frames):
+    ends, middles = simulated.t_us[::2], simulated.t_us[1::2]
+    windows = [
+        EventWindow([slice_time(events, *span) for events in simulated.events], *span) for span in windows_of(ends)
+    ]
+    recoverer = open_shipped("registered", frames=frames_at(simulated, [3, 15, 27]) if with_frames else None)
+    state, prediction = recoverer.step(recoverer.start(120, 180), windows)
+    for at_end, again in zip(prediction, recoverer.between(state, ends[1:].numpy()), strict=True):
+        assert at_end is again is None or torch.equal(at_end, again)
+    between = recoverer.between(state, middles.numpy())
+    at_ends, at_middles = (
+        (maps.dolp - simulated.dolp[first::2])[2:].square().mean() for maps, first in ((prediction, 2), (between, 1))
+    )
+    assert at_middles < 1.1 * at_ends
+
+
 def test_frames_of_a_camera_at_rest_are_averaged_where_nothing_happens_and_else_the_nearest_counts(
     simulated, windows, open_shipped
 ):
