@@ -11,8 +11,8 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 `ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
 --whole-file has `registered` in their place, the network over the whole recording. --frames has it, and for each
 entry of FRAMES_HZ the same with frames of the camera (`recover --frames`) and the frame nearest in time, held: frames
-of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. `train_mean` is the mean DoLP of
-the training photographs, `constant_real` that of the measured scenes of all other
+of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. The complementary filter has them too.
+`train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
 sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
 docs/results/robustness.json. The second command fills --training with links to the training photographs of both
@@ -39,8 +39,10 @@ from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, sc
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, slice_time
 from polarnet.methods import METHODS
+from polarnet.methods.complementary_filter import FilterConfig, FilterState, at_rest, integrate
+from polarnet.methods.intensities import from_intensities
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
@@ -68,6 +70,8 @@ BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`reco
 BETWEEN_US = 12_500  # time between those that are scored, every 25th
 EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
 FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
+FILTER_HZ, CONTRAST = 2.0, 0.2  # cutoff of that filter, of 0.1, 0.5 and 2 Hz the best on validation photographs
+SMALLEST_SHARE = 0.01  # of light behind a polarizer, of all
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 SENSORS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -190,7 +194,32 @@ def with_frames(scenes: SceneStore, test: TestSequence, context: Context) -> dic
         s1, s2 = frames.stokes[nearest].unbind(1)
         aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
         predictions[f"nearest of {rate_hz} frames/s"] = Prediction(torch.hypot(s1, s2).clamp(max=1), aolp)
+        predictions[f"cf, {rate_hz} frames/s"] = filtered_with(frames, test, context.setups["cf"].config)
     return predictions
+
+
+def filtered_with(frames: StokesFrames, test: TestSequence, config: FilterConfig) -> Prediction:
+    """The complementary filter with frames (Scheerlinck, Barnes, Mahony, ACCV 2018), with the sensor's thresholds.
+
+    The filter is linear in log intensity and DoLP knows no common factor, so frames of s1 and s2 alone serve it.
+    """
+    config = replace(config, cutoff_hz=FILTER_HZ, contrast_on=CONTRAST, contrast_off=-CONTRAST)
+    s1, s2 = torch.where(frames.valid[:, None], frames.stokes, 0.0).double().unbind(1)
+    light = torch.stack([1 + s1, 1 + s2, 1 - s1, 1 - s2], dim=1) / 2
+    logs = light.clamp(min=SMALLEST_SHARE).log().numpy()
+    state, shown = at_rest(4, *test.dolp.shape[-2:]), np.zeros_like(logs[0])
+    images = []
+    of_frames = [(int(t_us), number) for number, t_us in enumerate(frames.t_us)]
+    for t_us, number in sorted([(int(t_us), -1) for t_us in test.t_us[1:]] + of_frames):
+        new = [slice_time(events, state.t_us, t_us) for events in test.events]
+        state = integrate(state, new, t_us, config)
+        difference = state.log_intensity * np.exp(-config.rate_per_us * (t_us - state.updated_us))
+        if number < 0:
+            images.append(torch.from_numpy(np.exp(difference + shown)))
+            continue
+        state = FilterState(difference + shown - logs[number], np.full_like(state.updated_us, t_us), t_us)
+        shown = logs[number]
+    return from_intensities(torch.stack(images))
 
 
 def between_windows(
