@@ -84,7 +84,7 @@ def open_registered(setup: Setup) -> Recoverer:
         edges_us = past.edges_us if past.predicted is not None else np.array([windows[0].start_us])
         edges_us = np.append(edges_us, [window.stop_us for window in windows])
         known = Past(state, torch.cat([past.counts, counts]), together, torch.cat([past.steps, steps]), edges_us)
-        new = registered(known, config, setup.frames) if len(windows) > 1 else None
+        new = registered(known, config, setup.frames)
         latest = slice(max(0, len(known.counts) - config.overlap), None)
         predicted = each_map(together, lambda maps: maps[latest])
         kept = Past(state, known.counts[latest], predicted, known.steps[latest], edges_us[latest])
