@@ -12,7 +12,6 @@ from polarnet.metrics.lpips import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
 from polarnet.training.engine.loop import LoopConfig, train
-from polarnet.training.engine.parallel import join, launched
 from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.task import Task, describe, open_split
 
@@ -20,10 +19,7 @@ from polarnet.training.engine.task import Task, describe, open_split
 @hydra_stage
 def main(config: Config) -> None:
     """Train one network on the training split; a killed run of the same training resumes."""
-    if launched("stages.train", config.runtime):
-        return
     device = device_of(config.runtime)
-    join(device)
     settings, task = or_exit(lambda: _task(config))
     paths = config.paths
     split = open_split(EventStore.open(paths.events), paths.frames, task.encode)

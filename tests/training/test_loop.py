@@ -33,7 +33,6 @@ LOOP: dict[str, Any] = {
     "crop": [16, 20],
     "symmetries": True,
     "epochs": 2,
-    "accumulate": 1,
     "batch_size": 2,
     "bptt_windows": 3,
     "learning_rate": 1e-3,
