@@ -45,7 +45,6 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
     return Setup(
         config=getattr(config.methods, method.section, None),
         weights=weights,
-        sharpening=config.methods.sharpening,
         gain=config.methods.gain,
         registration=config.methods.registration,
         device=device_of(config.runtime),

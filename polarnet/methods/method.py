@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from polarnet.events.rotation import Rotation
@@ -21,16 +21,6 @@ PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes
 
 State = Any
 """State of a method before a window: tensors, or None at the start."""
-
-
-@section
-class SharpeningConfig:
-    """Section `methods.sharpening` of params.yaml: post-processing by E2VID's authors, with their defaults."""
-
-    unsharp_amount: NonNegativeFloat
-    """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
-    unsharp_sigma: PositiveFloat
-    """Width of the blur, in the units of the published kernel."""
 
 
 @section
@@ -57,7 +47,6 @@ class Setup:
     """Section `methods.NAME` of params.yaml; None for a method without settings."""
     weights: Path | None
     """Weights file; None if the method needs none or none is configured."""
-    sharpening: SharpeningConfig
     gain: GainConfig
     registration: RegistrationConfig
     device: torch.device
@@ -151,8 +140,6 @@ class Method:
     """Load the method. FileNotFoundError or ValueError if the weights are missing or of another network."""
     config: type | None = None
     """Class of the section `methods.NAME`; None: no section."""
-    sharpened: bool = False
-    """Whether the method reads section `methods.sharpening`."""
     networks: tuple[str, ...] = ()
     """Names of the networks that its weights, a checkpoint of polarnet, may hold; empty: it needs no weights."""
     shipped: bool = False
@@ -179,8 +166,6 @@ class Method:
         """Section of params.yaml that the method reads; None if it reads none."""
         if self.wraps is not None:
             return "methods"  # the section of the wrapped method and `methods.gain`
-        if self.sharpened:
-            return "methods.sharpening"
         return None if self.config is None else f"methods.{self.name}"
 
 

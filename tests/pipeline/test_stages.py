@@ -30,7 +30,7 @@ TINY = [
 MORE_ROWS = [
     "baselines.trained=[e2v,e2p]",
     "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}",
-    "+rows.firenet_published={needs: data/external/firenet_1000.pth.tar, settings: methods.sharpening}",
+    "+rows.firenet_published={needs: data/external/firenet_1000.pth.tar, settings: benchmark.precision}",
     "benchmark.methods=[zeros,train_mean,oracle_mean,cf,highpass,cf+gain,e2v,firenet_published,e2p,ours]",
 ]
 GENERATED = ("images", "scenes.zarr", "frames.zarr", "events.zarr")
