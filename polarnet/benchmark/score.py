@@ -180,15 +180,6 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
     }
 
 
-def mean_scores(rows: Sequence[FrameScore], metrics: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Mean over scenes by method and metric; a method lacks the metrics that were not computed for it."""
-    means = {metric: scene_means(rows, metric) for metric in metrics}
-    return {
-        method: {name: float(np.mean([*of[method].values()])) for name, of in means.items() if method in of}
-        for method in dict.fromkeys(row.method for row in rows)
-    }
-
-
 def summary(
     rows: Sequence[FrameScore], bootstrap_samples: int, seed: int
 ) -> dict[str, dict[str, float | list[float] | None]]:
