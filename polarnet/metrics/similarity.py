@@ -210,28 +210,6 @@ def frame_scores(
     return scores
 
 
-def score(
-    prediction: Prediction,
-    dolp: Float[Tensor, "n h w"],
-    aolp: Float[Tensor, "n h w"],
-    warmup_frames: int = 0,
-    valid: Bool[Tensor, "n h w"] | None = None,
-) -> dict[str, float]:
-    """Means of `frame_scores` over the frames after the first `warmup_frames`; ValueError if none is left.
-
-    >>> import torch
-    >>> from polarnet.metrics import score
-    >>> from polarnet.stokes import Prediction
-    >>> truth = torch.full((3, 16, 16), 0.5)
-    >>> score(Prediction(truth + 0.1), truth, truth)["mse"]
-    0.010...
-    """
-    if not 0 <= warmup_frames < len(dolp):
-        raise ValueError(f"warmup_frames: expected 0 to {len(dolp) - 1}, got {warmup_frames}")
-    scores = frame_scores(prediction, dolp, aolp, valid)
-    return {name: float(values[warmup_frames:].mean()) for name, values in scores.items()}
-
-
 def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:
     """Frames, checked to be floating-point and of one shape, and their mask, as tensors."""
     tensors = {name: as_tensor(name, values) for name, values in frames.items()}
