@@ -13,10 +13,9 @@ from torch import Tensor
 
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.methods import ROWS
-from polarnet.metrics.lpips import BACKBONES
+from polarnet.metrics.lpips import BACKBONES, Lpips
 from polarnet.metrics.similarity import (
     MIN_MSE,
-    Lpips,
     frame_scores,
     gradient_agreement,
     level_mse,

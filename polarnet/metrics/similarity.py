@@ -7,7 +7,7 @@ shapes. Where the data range matters (`psnr`, `ssim`), ValueError also for a sec
 With a mask `valid`, values at other pixels do not matter, and a frame without any valid pixel gives NaN, except in
 `gradient_agreement` (0) and `aolp_error_deg` (45 degrees).
 
-The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpips.py; its name is public here too.
+The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpips.py.
 """
 
 import functools
@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.metrics.lpips import Lpips as Lpips
 from polarnet.runtime.arrays import (
     Array,
     as_tensor,
