@@ -7,6 +7,8 @@ trains a baseline, with the settings of section `baselines.NAME`.
 from importlib import import_module
 from pathlib import Path
 
+import torch
+
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
 from polarnet.metrics.lpips import Lpips
 from polarnet.runtime.machine import device_of
@@ -20,7 +22,7 @@ from polarnet.training.engine.task import Task, describe, open_split
 def main(config: Config) -> None:
     """Train one network on the training split; a killed run of the same training resumes."""
     device = device_of(config.runtime)
-    settings, task = or_exit(lambda: _task(config))
+    settings, task = or_exit(lambda: _task(config, device))
     paths = config.paths
     split = open_split(EventStore.open(paths.events), paths.frames, task.encode)
     metadata = describe(task, split, settings, config.lpips.backbone, config.seed, device)
@@ -28,11 +30,11 @@ def main(config: Config) -> None:
     train(task, split, settings, recorder, config.seed, device, config.runtime.workers)
 
 
-def _task(config: Config) -> tuple[LoopConfig, Task]:
-    """Settings and task of the training; ValueError if LPIPS weights that it needs are missing."""
+def _task(config: Config, device: torch.device) -> tuple[LoopConfig, Task]:
+    """Settings and task of the training, with LPIPS on its device; ValueError if LPIPS weights are missing."""
 
     def lpips(weight: float) -> Lpips | None:
-        return Lpips.load(config.lpips.backbone) if weight > 0 else None
+        return Lpips.load(config.lpips.backbone).to(device) if weight > 0 else None
 
     tasks = import_module(f"polarnet.training.{config.baseline or 'dolp'}")
     if config.baseline is None:
