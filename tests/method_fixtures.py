@@ -29,7 +29,6 @@ NETWORK = {
     "swin_window": 4,
     "swin_heads": [2, 2],
     "residual_blocks": 1,
-    "input_mixing": "contrasts",
 }
 SECTIONS = {
     "cf": FilterConfig(0.5, 0.0, 0.1, -0.1, [-0.1, 1.2]),
