@@ -41,6 +41,13 @@ class Prediction(NamedTuple):
 
     c is 4, or 1 for a camera without polarizers, whose `dolp` is NaN."""
 
+    @property
+    def plain(self) -> Float[Tensor, "*b h w"] | None:
+        """Intensity seen by a camera without polarizers; None for any other."""
+        if self.intensities is None or self.intensities.shape[-3] > 1:
+            return None
+        return self.intensities[..., 0, :, :].float()
+
 
 class StokesFrames(NamedTuple):
     """What the frames of a polarization camera show of s1 = S1 / S0 and s2 = S2 / S0."""

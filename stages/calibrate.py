@@ -20,8 +20,11 @@ def main(config: Config) -> None:
         return
     about = {"recordings": dataclasses.asdict(config.recordings)}
     root = input_folder("recordings.root", config.recordings.root)
+    folders = sorted(path for path in root.iterdir() if path.is_dir())
+    if not folders:
+        raise SystemExit(f"{root}: expected a folder for each target with its eight captures, there is none")
     try:
-        targets = calibrate_targets(root, out, config.recordings, about)
+        targets = calibrate_targets(folders, out, config.recordings, about)
     except ValueError as error:
         raise SystemExit(str(error)) from None
     events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")

@@ -7,12 +7,13 @@ trains a baseline, with the settings of section `baselines.NAME`.
 from importlib import import_module
 from pathlib import Path
 
+import torch
+
 from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
 from polarnet.metrics.lpips import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
 from polarnet.training.engine.loop import LoopConfig, train
-from polarnet.training.engine.parallel import join, launched
 from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.task import Task, describe, open_split
 
@@ -20,11 +21,8 @@ from polarnet.training.engine.task import Task, describe, open_split
 @hydra_stage
 def main(config: Config) -> None:
     """Train one network on the training split; a killed run of the same training resumes."""
-    if launched("stages.train", config.runtime):
-        return
     device = device_of(config.runtime)
-    join(device)
-    settings, task = or_exit(lambda: _task(config))
+    settings, task = or_exit(lambda: _task(config, device))
     paths = config.paths
     split = open_split(EventStore.open(paths.events), paths.frames, task.encode)
     metadata = describe(task, split, settings, config.lpips.backbone, config.seed, device)
@@ -32,11 +30,11 @@ def main(config: Config) -> None:
     train(task, split, settings, recorder, config.seed, device, config.runtime.workers)
 
 
-def _task(config: Config) -> tuple[LoopConfig, Task]:
-    """Settings and task of the training; ValueError if LPIPS weights that it needs are missing."""
+def _task(config: Config, device: torch.device) -> tuple[LoopConfig, Task]:
+    """Settings and task of the training, with LPIPS on its device; ValueError if LPIPS weights are missing."""
 
     def lpips(weight: float) -> Lpips | None:
-        return Lpips.load(config.lpips.backbone) if weight > 0 else None
+        return Lpips.load(config.lpips.backbone).to(device) if weight > 0 else None
 
     tasks = import_module(f"polarnet.training.{config.baseline or 'dolp'}")
     if config.baseline is None:

@@ -20,8 +20,8 @@ from jaxtyping import Float, Int64
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from polarnet.benchmark.rows import Context, opened, predictions_of, why_left_out
-from polarnet.benchmark.score import FrameScore, mean_scores, score_sequence
+from polarnet.benchmark.rows import Context, available, opened, predictions_of
+from polarnet.benchmark.score import FrameScore, scene_means, score_sequence
 from polarnet.benchmark.sequences import TestSequence, train_mean_dolp
 from polarnet.config.pipeline import context_of, pipeline_set, set_names
 from polarnet.config.tree import load
@@ -58,10 +58,11 @@ def since_start(sequences: Iterable[TestSequence], methods: Sequence[str], conte
             bins.setdefault(k, []).append((per_pixel[row.window], row))
     table: dict[str, list[dict]] = {method: [] for method in methods}
     for _, found in sorted(bins.items()):
-        scores = mean_scores([row for _, row in found], ("psnr", "corr"))
+        means = {metric: scene_means([row for _, row in found], metric) for metric in ("psnr", "corr")}
         rate, frames = float(np.mean([rate for rate, _ in found])), len(found) // len(methods)
         for method in methods:
-            table[method].append({"events_per_pixel": rate, "frames": frames, **scores[method]})
+            scores = {metric: float(np.mean([*of[method].values()])) for metric, of in means.items()}
+            table[method].append({"events_per_pixel": rate, "frames": frames, **scores})
     return table
 
 
@@ -139,8 +140,9 @@ def main() -> None:
     tests = pipeline_set(config, "simulated")
     mean = train_mean_dolp(tests.frames, config.benchmark.warmup_windows)
     context = context_of(config, [*arguments.methods, "ours"], mean, arguments.weights)
-    if reason := why_left_out("ours", context):
-        parser.error(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
+    _, left_out = available(["ours"], context)
+    if left_out:
+        parser.error(f"the event budget needs the DoLP network: {left_out['ours']}; give --weights FILE")
     results: dict[str, Any] = {"sequences": list(tests.sequences)}
     sequences = (tests.sequence(name) for name in tests.sequences)
     results["since_start"] = since_start(sequences, arguments.methods, context)

@@ -50,7 +50,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         write_rig(scratch / "raw" / name, scene, RIG, recordings, emulator, seed=1, threads=2)
-        (found,) = calibrate_targets(scratch / "raw", scratch / "calibrated", recordings, {})
+        (found,) = calibrate_targets([scratch / "raw" / name], scratch / "calibrated", recordings, {})
         draw_calibration(found, recordings, PICTURES / "recordings_calibration.png")
         first = EVENT_CAPTURES[0]
         events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)

@@ -12,7 +12,7 @@ from polarnet.events.rotation import steady_rotation
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS, ROWS
 from polarnet.methods.complementary_filter import FilterConfig
-from polarnet.methods.method import GainConfig, Setup, SharpeningConfig
+from polarnet.methods.method import GainConfig, Setup
 from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.cista_tc.network import CistaTc
@@ -29,7 +29,6 @@ NETWORK = {
     "swin_window": 4,
     "swin_heads": [2, 2],
     "residual_blocks": 1,
-    "input_mixing": "contrasts",
 }
 SECTIONS = {
     "cf": FilterConfig(0.5, 0.0, 0.1, -0.1, [-0.1, 1.2]),
@@ -101,7 +100,6 @@ def make_setup(checkpoints):
         values = {
             "config": SECTIONS.get(section),
             "weights": checkpoints.get(section),
-            "sharpening": SharpeningConfig(0.3, 1.0),
             "gain": GainConfig(10, 5, 20_000, 0.1, 0.0),
             "registration": REGISTRATION,
             "device": torch.device("cpu"),

@@ -5,9 +5,8 @@ import time
 from dataclasses import replace
 from typing import Any
 
-import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import flop_registry, sdpa_flop, shape_wrapper
+from torch.utils.flop_counter import flop_registry
 
 from polarnet.benchmark.rows import Context, opened, predictions_of
 from polarnet.benchmark.score import Cost
@@ -17,13 +16,6 @@ from polarnet.methods import METHODS
 COUNTED_WINDOWS = 3  # windows to count arithmetic over: enough for the state to be passed on
 TIMED_WINDOWS = 6
 REPEATS = 3  # number of timings; the median is reported
-
-# Formulas of torch's own counter (2.13), and that of fused attention on CPUs, which it omits.
-FLOPS = flop_registry | {
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: shape_wrapper(
-        lambda q, k, v, *_, out_shape=None, **__: sdpa_flop(q, k, v)
-    )
-}
 
 
 def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
@@ -55,7 +47,7 @@ def first_windows(sequence: TestSequence, count: int) -> TestSequence:
 
 
 class _Flops(TorchDispatchMode):
-    """Adds up the FLOPs of the operations that have a formula."""
+    """Adds up the FLOPs of the operations that have a formula in torch's own counter."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,6 +60,6 @@ class _Flops(TorchDispatchMode):
     def __torch_dispatch__(self, operation: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run the operation and count its FLOPs."""
         out = operation(*args, **(kwargs or {}))
-        if (formula := FLOPS.get(operation.overloadpacket)) is not None:
+        if (formula := flop_registry.get(operation.overloadpacket)) is not None:
             self.total += formula(*args, **(kwargs or {}), out_val=out)
         return out

@@ -12,7 +12,7 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS, ROWS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, joined, weights_record, why_absent
-from polarnet.metrics.references import REFERENCES, Reference
+from polarnet.metrics.references import REFERENCES
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 from polarnet.terminal.progress import steps
@@ -79,17 +79,15 @@ def _opened(method: Method, setup: Setup, written: int | None) -> Recoverer:
 
 def available(names: Sequence[str], context: Context) -> tuple[list[str], dict[str, str]]:
     """The rows that can run, in the given order, and the reasons for leaving out the others."""
-    reasons = {name: reason for name in names if (reason := why_left_out(name, context))}
+    reasons = {}
+    for name in names:
+        row = ROWS[name]
+        if isinstance(row, Method):
+            if reason := why_absent(row, context.setups[row.section]):
+                reasons[name] = reason
+        elif row.needs_train_mean and context.train_mean is None:
+            reasons[name] = "the training split is not there; run `dvc repro synthesize`"
     return [name for name in names if name not in reasons], reasons
-
-
-def why_left_out(name: str, context: Context) -> str | None:
-    """Reason why a row cannot run; None if it can."""
-    row = ROWS[name]
-    if isinstance(row, Reference):
-        missing = row.needs_train_mean and context.train_mean is None
-        return "the training split is not there; run `dvc repro synthesize`" if missing else None
-    return why_absent(row, context.setups[row.section])
 
 
 def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, str]]:

@@ -13,8 +13,8 @@ from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_se
 from polarnet.benchmark.sequences import BenchmarkSet, TestSequence
 from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.streaming import encode_windows
+from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.reliability import HIGHEST, LOWEST, Reliability, reliability
-from polarnet.metrics.similarity import Lpips
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import dequantise, quantise
 from polarnet.storage.panels import Panel, Shown, angle_bytes, fraction_bytes, signed_bytes

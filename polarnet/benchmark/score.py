@@ -13,10 +13,9 @@ from torch import Tensor
 
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.methods import ROWS
-from polarnet.metrics.lpips import BACKBONES
+from polarnet.metrics.lpips import BACKBONES, Lpips
 from polarnet.metrics.similarity import (
     MIN_MSE,
-    Lpips,
     frame_scores,
     gradient_agreement,
     level_mse,
@@ -177,15 +176,6 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
         method: {scene: math.fsum(of_scene) / len(of_scene) for scene, of_scene in sorted(scenes.items())}
         for method, scenes in values.items()
         if method not in lacking
-    }
-
-
-def mean_scores(rows: Sequence[FrameScore], metrics: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Mean over scenes by method and metric; a method lacks the metrics that were not computed for it."""
-    means = {metric: scene_means(rows, metric) for metric in metrics}
-    return {
-        method: {name: float(np.mean([*of[method].values()])) for name, of in means.items() if method in of}
-        for method in dict.fromkeys(row.method for row in rows)
     }
 
 

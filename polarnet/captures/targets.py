@@ -5,7 +5,7 @@ The stores `events.zarr` and `frames.zarr` have the layout of simulated sequence
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,29 +88,29 @@ class Calibrated(NamedTuple):
     duration_us: int
 
 
-def calibrate_targets(root: Path, out: Path, config: RecordingsConfig, about: Mapping[str, Any]) -> list[Calibrated]:
-    """Put every target of `root` on one clock and write events.zarr, frames.zarr and calibration.json into `out`.
+def calibrate_targets(
+    folders: Sequence[Path], out: Path, config: RecordingsConfig, about: Mapping[str, Any]
+) -> list[Calibrated]:
+    """Put the targets in `folders` on one clock; write events.zarr, frames.zarr and calibration.json into `out`.
 
     `about` becomes the stores' attributes. RecordingError where a file is missing or damaged, or a start is not found.
     """
-    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    if not names:
-        raise RecordingError(f"{root}: expected a folder for each target with its eight captures, there is none")
-    for name in names:
-        find_captures(root / name)  # a missing file is reported before hours of decoding
+    names = [folder.name for folder in folders]
+    for folder in folders:
+        find_captures(folder)  # a missing file is reported before hours of decoding
     start_over(out, enabled=True)
     height, width = config.size
     events = EventStore.create(out / "events.zarr", names, height, width, about)
     contents = Contents(dict.fromkeys(names, "test"), about)
     frames = FrameStore.create(out / "frames.zarr", contents, height, width)
     targets = []
-    for name in ProgressBar(names, "calibrate", unit="target"):
-        target = read_target(root / name, config)
+    for folder in ProgressBar(folders, "calibrate", unit="target"):
+        target = read_target(folder, config)
         one, clean = calibrate_target(target, config)
         channels, t_us, intensity = aligned(target._replace(events=clean), one, config)
         vectors = stokes.stokes_from_intensities(intensity)
-        events.write(name, channels, int(t_us[-1]))
-        frames.write(name, t_us, intensity, stokes.dolp(vectors).clamp(0, 1), stokes.aolp(vectors))
+        events.write(target.name, channels, int(t_us[-1]))
+        frames.write(target.name, t_us, intensity, stokes.dolp(vectors).clamp(0, 1), stokes.aolp(vectors))
         targets.append(one)
     events.finish()
     frames.finish()

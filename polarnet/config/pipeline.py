@@ -13,8 +13,8 @@ from polarnet.config.tree import Config, or_exit
 from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
+from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.references import REFERENCES
-from polarnet.metrics.similarity import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -45,7 +45,6 @@ def setup_of(config: Config, method: Method, weights: Path | None = None) -> Set
     return Setup(
         config=getattr(config.methods, method.section, None),
         weights=weights,
-        sharpening=config.methods.sharpening,
         gain=config.methods.gain,
         registration=config.methods.registration,
         device=device_of(config.runtime),

@@ -19,7 +19,7 @@ from polarnet.captures.dot import RecordingsConfig
 from polarnet.config.experiments import check_overrides
 from polarnet.config.origins import Run
 from polarnet.methods import METHODS
-from polarnet.methods.method import GainConfig, SharpeningConfig
+from polarnet.methods.method import GainConfig
 from polarnet.methods.registration import RegistrationConfig
 from polarnet.metrics.lpips import BACKBONES, LpipsConfig, installed_version
 from polarnet.networks.registry import NETWORKS, NetworkConfig
@@ -62,9 +62,9 @@ else:
     MethodsConfig = section_of(
         "MethodsConfig",
         {m.name: m.config for m in METHODS.values() if m.config is not None}
-        | {"sharpening": SharpeningConfig, "gain": GainConfig, "registration": RegistrationConfig},
+        | {"gain": GainConfig, "registration": RegistrationConfig},
     )
-    """Section `methods` of params.yaml: one section for each method with settings, and three that methods share."""
+    """Section `methods` of params.yaml: one section for each method with settings, and two that methods share."""
     _OF_LOOP = typing.get_type_hints(LoopConfig, include_extras=True)
     SharedTrainingConfig = section_of(
         "SharedTrainingConfig", {name: hint for name, hint in _OF_LOOP.items() if name not in OWN_KEYS}

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensities import from_intensities, with_gain
-from polarnet.methods.method import Method, Recoverer, Setup, SharpeningConfig, network_recoverer, weights_file
+from polarnet.methods.method import Method, Recoverer, Setup, network_recoverer, weights_file
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2v import ARCHITECTURES
@@ -26,7 +26,8 @@ from polarnet.networks.e2v.e2vid import E2vid
 from polarnet.networks.e2v.firenet import FireNet
 from polarnet.stokes import Prediction
 
-KERNEL_SIZE = 5  # blur kernel of the unsharp mask, pixels
+UNSHARP_AMOUNT, UNSHARP_SIGMA = 0.3, 1.0  # defaults of E2VID's authors; sigma in the units of their kernel
+KERNEL_SIZE = 5  # pixels
 
 Networks = Mapping[str, Any]
 """Class of each network that a method accepts, by the name in its checkpoints."""
@@ -69,7 +70,7 @@ def intensity_methods(
             return normalise_nonzero(grids) if normalised else grids
 
         def prediction_of(raw: Float[Tensor, "n c h w"]) -> Prediction:
-            return from_intensities(sharper(raw, setup.sharpening) if sharpened else raw.clamp(0, 1))
+            return from_intensities(sharper(raw) if sharpened else raw.clamp(0, 1))
 
         return network_recoverer(network, setup, encode, prediction_of)
 
@@ -78,7 +79,6 @@ def intensity_methods(
         label=label,
         colour=colour,
         open=open_network,
-        sharpened=sharpened,
         networks=tuple(networks),
         reconstructs=True,
         about=about,
@@ -91,26 +91,25 @@ def voxel_grids(window: EventWindow, bins: int) -> Float[Tensor, "c bins h w"]:
     return torch.stack([voxel_grid(events, bins) for events in window.channels])
 
 
-def sharper(images: Float[Tensor, "t c h w"], config: SharpeningConfig) -> Float[Tensor, "t c h w"]:
+def sharper(images: Float[Tensor, "t c h w"]) -> Float[Tensor, "t c h w"]:
     """Post-processing by E2VID's authors: (1 + amount) image - amount blurred, mirrored at the border, then clipped.
 
     The authors then round images to 8 bits; polarnet does not.
     """
-    if config.unsharp_amount == 0:
-        return images.clamp(0, 1)
-    kernel = blur_kernel(config.unsharp_sigma).to(images)[None, None]
+    kernel = blur_kernel().to(images)[None, None]
     padded = F.pad(images.flatten(0, 1)[:, None], (KERNEL_SIZE // 2,) * 4, mode="reflect")
     blurred = F.conv2d(padded, kernel).view_as(images)
-    return ((1 + config.unsharp_amount) * images - config.unsharp_amount * blurred).clamp(0, 1)
+    return ((1 + UNSHARP_AMOUNT) * images - UNSHARP_AMOUNT * blurred).clamp(0, 1)
 
 
-def blur_kernel(sigma: float) -> Float[Tensor, "5 5"]:
+def blur_kernel() -> Float[Tensor, "5 5"]:
     """The published kernel: square root of the outer product of 5 normal bin probabilities, with sum 1.
 
     The bins lie in [-sigma - step / 2, sigma + step / 2] of the standard normal, step = (2 sigma + 1) / 5.
     """
-    step = (2 * sigma + 1) / KERNEL_SIZE
-    edges = torch.linspace(-sigma - step / 2, sigma + step / 2, KERNEL_SIZE + 1, dtype=torch.float64)
+    step = (2 * UNSHARP_SIGMA + 1) / KERNEL_SIZE
+    last = UNSHARP_SIGMA + step / 2
+    edges = torch.linspace(-last, last, KERNEL_SIZE + 1, dtype=torch.float64)
     shares = torch.tensor([NormalDist().cdf(edge) for edge in edges.tolist()], dtype=torch.float64).diff()
     kernel = torch.outer(shares, shares).sqrt()
     return kernel / kernel.sum()

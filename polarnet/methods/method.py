@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Int64
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from torch import Tensor, nn
 
 from polarnet.events.rotation import Rotation
@@ -23,16 +23,6 @@ PIXELS_AT_ONCE = 4 * 120 * 180  # total over the windows that a method processes
 
 State = Any
 """State of a method before a window: tensors, or None at the start."""
-
-
-@section
-class SharpeningConfig:
-    """Section `methods.sharpening` of params.yaml: post-processing by E2VID's authors, with their defaults."""
-
-    unsharp_amount: NonNegativeFloat
-    """Factor on the difference between image and blurred copy, which is added to the image; 0: off."""
-    unsharp_sigma: PositiveFloat
-    """Width of the blur, in the units of the published kernel."""
 
 
 @section
@@ -59,7 +49,6 @@ class Setup:
     """Section `methods.NAME` of params.yaml; None for a method without settings."""
     weights: Path | None
     """Weights file; None if the method needs none or none is configured."""
-    sharpening: SharpeningConfig
     gain: GainConfig
     registration: RegistrationConfig
     device: torch.device
@@ -156,8 +145,6 @@ class Method:
     """Load the method. FileNotFoundError or ValueError if the weights are missing or of another network."""
     config: type | None = None
     """Class of the section `methods.NAME`; None: no section."""
-    sharpened: bool = False
-    """Whether the method reads section `methods.sharpening`."""
     networks: tuple[str, ...] = ()
     """Names of the networks that its weights, a checkpoint of polarnet, may hold; empty: it needs no weights."""
     shipped: bool = False
@@ -184,8 +171,6 @@ class Method:
         """Section of params.yaml that the method reads; None if it reads none."""
         if self.wraps is not None:
             return "methods"  # the section of the wrapped method and `methods.gain`
-        if self.sharpened:
-            return "methods.sharpening"
         return None if self.config is None else f"methods.{self.name}"
 
 

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from polarnet.metrics.similarity import frame_scores as frame_scores
     from polarnet.metrics.similarity import mse as mse
     from polarnet.metrics.similarity import psnr as psnr
-    from polarnet.metrics.similarity import score as score
     from polarnet.metrics.similarity import ssim as ssim
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

@@ -7,7 +7,7 @@ shapes. Where the data range matters (`psnr`, `ssim`), ValueError also for a sec
 With a mask `valid`, values at other pixels do not matter, and a frame without any valid pixel gives NaN, except in
 `gradient_agreement` (0) and `aolp_error_deg` (45 degrees).
 
-The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpips.py; its name is public here too.
+The perceptual distance, `Lpips`, is a network and lives in polarnet/metrics/lpips.py.
 """
 
 import functools
@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.metrics.lpips import Lpips as Lpips
 from polarnet.runtime.arrays import (
     Array,
     as_tensor,
@@ -208,28 +207,6 @@ def frame_scores(
     if prediction.aolp is not None:
         scores["aolp_deg"] = aolp_error_deg(prediction.aolp, aolp, dolp, valid)
     return scores
-
-
-def score(
-    prediction: Prediction,
-    dolp: Float[Tensor, "n h w"],
-    aolp: Float[Tensor, "n h w"],
-    warmup_frames: int = 0,
-    valid: Bool[Tensor, "n h w"] | None = None,
-) -> dict[str, float]:
-    """Means of `frame_scores` over the frames after the first `warmup_frames`; ValueError if none is left.
-
-    >>> import torch
-    >>> from polarnet.metrics import score
-    >>> from polarnet.stokes import Prediction
-    >>> truth = torch.full((3, 16, 16), 0.5)
-    >>> score(Prediction(truth + 0.1), truth, truth)["mse"]
-    0.010...
-    """
-    if not 0 <= warmup_frames < len(dolp):
-        raise ValueError(f"warmup_frames: expected 0 to {len(dolp) - 1}, got {warmup_frames}")
-    scores = frame_scores(prediction, dolp, aolp, valid)
-    return {name: float(values[warmup_frames:].mean()) for name, values in scores.items()}
 
 
 def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:

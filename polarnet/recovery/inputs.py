@@ -218,11 +218,8 @@ def _named(sequence: str | None, names: list[str], where: str) -> str:
 def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Channels:
     if config is None:
         raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
-    root = work / "targets"
-    root.mkdir(parents=True)
-    target = root / folder.resolve().name
-    target.symlink_to(folder.resolve(), target_is_directory=True)
-    calibrate_targets(root, work / "calibrated", config, {})
+    target = folder.resolve()
+    calibrate_targets([target], work / "calibrated", config, {})
     return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 

@@ -235,8 +235,7 @@ def _live_runs(
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:
     """ValueError for a DoLP with NaN or infinity, but for a camera without polarizers, which has none."""
-    plain = frame.intensities is not None and len(frame.intensities) == 1
-    if not plain and not frame.dolp.isfinite().all():
+    if frame.plain is None and not frame.dolp.isfinite().all():
         raise ValueError(
             f"the DoLP of the window from {window.start_us} to {window.stop_us} us is not finite: the weights or the "
             "thresholds are no working ones; the frames before it are whole"

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from polarnet.events.representations import polarity_sums
@@ -35,7 +35,7 @@ from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_pl
 from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of, with_even_sides
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
-from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
+from polarnet.storage.frames import ANGLE_STEPS, FRACTION_STEPS, FRAMES_PER_CHUNK, Polarization
 from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
@@ -126,7 +126,7 @@ class RecoveryWriter:
 
     def add(self, window: EventWindow, prediction: Prediction, live: bool = False) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long, or `live` and cores few."""
-        self._plain = plain_intensity(prediction) is not None
+        self._plain = prediction.plain is not None
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
         self._wait(0 if live and usable_cores() <= FEW_CORES else MAX_QUEUED)
         self.frames += 1
@@ -193,11 +193,11 @@ class RecoveryWriter:
         return None if intensities is None else intensities.mean(0).float()
 
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
-        plain = plain_intensity(prediction)
+        plain = prediction.plain
         name, values = ("dolp", prediction.dolp) if plain is None else ("intensity", plain)
-        frame = {"t_us": np.array(window.stop_us, np.int64), name: _quantised(values * 65535, 65535)}
+        frame = {"t_us": np.array(window.stop_us, np.int64), name: _quantised(values * FRACTION_STEPS)}
         if prediction.aolp is not None:
-            frame["aolp"] = _quantised(prediction.aolp * (65536 / np.pi) % 65536, 65535)
+            frame["aolp"] = _quantised(prediction.aolp * (ANGLE_STEPS / np.pi) % ANGLE_STEPS)
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         self._arrays.add(frame)
@@ -205,7 +205,7 @@ class RecoveryWriter:
 
 def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Captioned:
     """The maps of a frame as pictures, by caption."""
-    plain = plain_intensity(prediction)
+    plain = prediction.plain
     maps = {DOLP: dolp_image(prediction.dolp)} if plain is None else {INTENSITY: intensity_image(plain)}
     if prediction.aolp is not None:
         maps[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
@@ -217,22 +217,15 @@ def _side_by_side(maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
     return with_even_sides(np.concatenate([part for one in maps.values() for part in (one, gap)][:-1], axis=1))
 
 
-def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
-    """Intensity of a frame of a camera without polarizers; None for any other frame."""
-    if prediction.intensities is None or len(prediction.intensities) > 1:
-        return None
-    return prediction.intensities[0].float()
-
-
-def _quantised(values: Tensor, largest: int) -> np.ndarray:
-    return values.round().clamp(0, largest).numpy().astype(np.uint16)
+def _quantised(steps: Tensor) -> UInt16[np.ndarray, "h w"]:
+    return steps.round().clamp(0, FRACTION_STEPS).numpy().astype(np.uint16)
 
 
 def _byte_maps(
     events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
 ) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
     """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
-    plain = plain_intensity(prediction)
+    plain = prediction.plain
     maps: dict[tuple[str, Kind], Tensor] = {("Events", "events"): signed_bytes(events)}
     if true is not None:
         maps |= {

@@ -37,12 +37,6 @@ class RuntimeConfig:
     """Threads of torch and numba in each process; 0: one per core."""
     workers: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes that share the sequences."""
-    devices: Annotated[int, Field(gt=0, le=4096)]
-    """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""
-    nodes: Annotated[int, Field(gt=0, le=4096)]
-    """Number of machines that share a training; the same command starts on each."""
-    rendezvous: str
-    """Address at which the machines meet: host:port of one of them."""
 
 
 def seed_for(seed: int, name: str, purpose: str) -> int:
@@ -99,17 +93,11 @@ def threads_of(config: RuntimeConfig) -> int:
     return config.threads or max(1, usable_cores() // config.workers)
 
 
-def processes_here() -> int:
-    """Number of processes on this machine that share this training (polarnet.training.engine.parallel)."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-
-
 def device_of(config: RuntimeConfig) -> torch.device:
     """The torch device that `config.device` names; ValueError if it asks for a GPU and there is none."""
-    own_gpu = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"  # torchrun's number of this process
     if config.device == "auto":
-        return torch.device(own_gpu if torch.cuda.is_available() else "cpu")
-    device = torch.device(own_gpu if config.device == "cuda" else config.device)
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(config.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"runtime.device={config.device}: torch {torch.__version__} sees no GPU; use device=cpu")
     return device
@@ -175,7 +163,7 @@ def tune() -> None:
 
 def configure(config: RuntimeConfig, seed: int) -> torch.device:
     """Set threads, seed torch, keep freed memory and request deterministic kernels; returns the device to run on."""
-    limit_threads(config.threads or max(1, usable_cores() // processes_here()))
+    limit_threads(config.threads or usable_cores())
     tune()
     torch.manual_seed(seed)
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from polarnet.events.representations import REPRESENTATIONS, channels_of
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.training.engine.loop import TrainConfig
 from polarnet.training.engine.losses import LossConfig, PolarizationLoss

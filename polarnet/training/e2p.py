@@ -10,7 +10,7 @@ from torch import Tensor
 
 from polarnet.events.representations import voxel_grid
 from polarnet.events.stream import Events
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips
 from polarnet.networks.e2p.network import BRANCHES, E2p, coded_aolp, interleaved
 from polarnet.runtime.sections import section
 from polarnet.training.engine.loop import LoopConfig

@@ -13,7 +13,7 @@ from polarnet.benchmark.score import (
     score_sequence,
     summary,
 )
-from polarnet.metrics.similarity import Lpips
+from polarnet.metrics.lpips import Lpips
 from polarnet.stokes import Prediction
 
 CPU = torch.device("cpu")

@@ -66,7 +66,7 @@ def rig(project_root, config, tmp_path_factory):
 def calibrated(rig, config, tmp_path_factory):
     root, truth = rig
     folder = tmp_path_factory.mktemp("calibrated")
-    (found,) = calibrate_targets(root, folder / "out", config, {})
+    (found,) = calibrate_targets([root / "one"], folder / "out", config, {})
     return folder / "out", found, truth
 
 

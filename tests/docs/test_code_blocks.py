@@ -70,7 +70,7 @@ COMMANDS = [(block.page.name, words) for block in blocks("bash", "sh") for words
 def test_a_command_of_the_documentation_is_accepted_by_its_parser(page, words, monkeypatch):
     monkeypatch.chdir(ROOT)
     program, *arguments = words
-    if program in ("python", "torchrun"):
+    if program == "python":
         module, *rest = arguments[arguments.index("-m") + 1 :]
         assert importlib.util.find_spec(module) is not None
         if module.startswith("stages."):

@@ -135,7 +135,7 @@ def test_published_networks_are_sharpened_and_firenet_plus_sees_plain_voxels(seq
     with torch.no_grad():
         raw, _ = network.unroll(grids)
     intensities = recovered(open_method("firenetplus_published"), sequence.windows).intensities
-    torch.testing.assert_close(intensities, sharper(raw, setup.sharpening))
+    torch.testing.assert_close(intensities, sharper(raw))
     (normalised, _) = intensity_methods("m", "m", "#000000", {"firenet": FireNet}, sharpened=True)
     assert not torch.allclose(intensities, recovered(normalised.open(setup), sequence.windows).intensities)
 

@@ -4,7 +4,7 @@ import torch
 from method_fixtures import REGISTRATION
 
 from polarnet.events.representations import event_counts
-from polarnet.events.stream import select, slice_time
+from polarnet.events.stream import crop, select, slice_time
 from polarnet.events.streaming import EventWindow, encode_windows, windows_of
 from polarnet.methods import METHODS
 from polarnet.methods.registration import Panorama, mosaic, offset_field, register, views
@@ -106,6 +106,24 @@ def test_the_next_block_is_registered_with_the_windows_before_it(windows, open_s
     assert torch.equal(latest.dolp, again.dolp)  # the state before has not changed
     alone = recoverer.step(recoverer.start(120, 180)._replace(inner=state.inner), windows[12:18])[1]
     assert not torch.equal(latest.dolp, alone.dolp)
+
+
+def test_a_lone_last_window_sees_the_panorama_and_the_frames_of_the_block_before_it(simulated, windows, open_shipped):
+    """On a quarter of the sensor, to save time."""
+    part = [
+        EventWindow([crop(one, 30, 45, 60, 90) for one in window.channels], window.start_us, window.stop_us)
+        for window in windows[:13]
+    ]
+    frames, truth = frames_at(simulated, [7]), simulated.dolp[13, 30:90, 45:135]
+    frames = frames._replace(stokes=frames.stokes[..., 30:90, 45:135], valid=frames.valid[..., 30:90, 45:135])
+    errors = {}
+    for name, changes in (("ours", {}), ("registered", {}), ("registered", {"frames": frames})):
+        recoverer = open_shipped(name, **changes)
+        state, _ = recoverer.step(recoverer.start(60, 90), part[:12])
+        _, prediction = recoverer.step(state, part[12:])
+        assert prediction.dolp.shape == (1, 60, 90)
+        errors[name, *changes] = (prediction.dolp[0] - truth).square().mean()
+    assert errors["registered", "frames"] < errors["registered",] < errors["ours",]
 
 
 @pytest.mark.parametrize("case", ["one window", "few windows", "no motion"])

@@ -17,7 +17,6 @@ from polarnet.metrics.similarity import (
     mse,
     pattern_mse,
     psnr,
-    score,
     spread_mse,
     ssim,
 )
@@ -200,22 +199,13 @@ def test_a_slope_below_a_tenth_of_a_stored_step_per_pixel_is_no_edge_on_any_shap
             assert gradient_agreement(frame, frame).item() == pytest.approx(agreement)
 
 
-DOLP = torch.full((3, 8, 8), 0.5)
-OFFSETS = torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
-"""Error of DoLP in each frame: squared 0.16, 0.04 and 0.01."""
-
-
-def test_the_mean_covers_the_frames_after_the_warmup_and_an_angle_if_the_method_predicts_one():
-    prediction = Prediction(DOLP + OFFSETS)
-    for warmup, expected in ((0, 0.07), (1, 0.025), (2, 0.01)):
-        assert score(prediction, DOLP, DOLP, warmup)["mse"] == pytest.approx(expected, abs=1e-6)
-    assert score(prediction, DOLP, DOLP)["mse"] == pytest.approx(0.07, abs=1e-6)
-    for warmup in (-1, 3):
-        with pytest.raises(ValueError, match=f"expected 0 to 2, got {warmup}"):
-            score(prediction, DOLP, DOLP, warmup)
-    assert "aolp_deg" not in frame_scores(Prediction(DOLP), DOLP, DOLP)
-    turned = Prediction(DOLP, aolp=DOLP + math.radians(10))
-    assert frame_scores(turned, DOLP, DOLP)["aolp_deg"].tolist() == pytest.approx([10, 10, 10], abs=1e-4)
+def test_each_frame_has_its_scores_and_an_angle_if_the_method_predicts_one():
+    dolp, offsets = torch.full((3, 8, 8), 0.5), torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
+    scores = frame_scores(Prediction(dolp + offsets), dolp, dolp)
+    assert scores["mse"].tolist() == pytest.approx([0.16, 0.04, 0.01], abs=1e-6)
+    assert "aolp_deg" not in scores
+    turned = Prediction(dolp, aolp=dolp + math.radians(10))
+    assert frame_scores(turned, dolp, dolp)["aolp_deg"].tolist() == pytest.approx([10, 10, 10], abs=1e-4)
 
 
 def test_errors_of_the_predicted_size_lie_on_the_diagonal_and_sequences_add_up():

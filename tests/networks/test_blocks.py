@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import ConvGRU, Level, ResidualBlock, conv3x3, on_blocks
+from polarnet.networks.base.blocks import ConvGRU, Level, ResidualBlock, compressed, contrasts, conv3x3, on_blocks
 
 
 def sigmoid(x: float) -> float:
@@ -55,3 +55,12 @@ def test_a_residual_block_with_zero_weights_is_a_relu():
     for parameter in block.parameters():
         torch.nn.init.zeros_(parameter)
     assert block(torch.tensor([-1.0, 2.0]).view(1, 2, 1, 1)).flatten().tolist() == [0.0, 2.0]
+
+
+def test_inputs_are_compressed_contrasts_of_the_channels_bin_by_bin():
+    values = torch.tensor([[-(torch.e - 1), 0.0, torch.e - 1]])
+    torch.testing.assert_close(compressed(values), torch.tensor([[-1.0, 0.0, 1.0]]))
+    channels = torch.arange(8.0).view(8, 1, 1) ** 2  # two bins of each of the four polarizers
+    expected = [(0 + 4 + 16 + 36) / 2, (1 + 9 + 25 + 49) / 2, 0 - 16, 1 - 25, 4 - 36, 9 - 49, 16 - 40, 26 - 58]
+    assert contrasts(channels).flatten().tolist() == expected
+    assert contrasts(torch.full((4, 1, 1), 3.0)).flatten().tolist() == [6, 0, 0, 0]  # light that is not polarized

@@ -188,7 +188,7 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
 @pytest.mark.parametrize(
     ("change", "stages"),
     [
-        (put("methods.sharpening", unsharp_amount=0.5), OF_ALL_METHODS | {"report"}),
+        (put("methods.gain", rounds=3), OF_ALL_METHODS | {"report"}),
         thorough(put("baselines.e2v", epochs=2), {"train_baseline@e2v", "report"}),
         thorough(put("methods.cf", cutoff_hz=1.0), OF_ALL_METHODS | {"benchmark@cf", "report"}),
         thorough(put("loss", mse=12.0), {"train", "report"}),

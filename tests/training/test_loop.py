@@ -33,7 +33,6 @@ LOOP: dict[str, Any] = {
     "crop": [16, 20],
     "symmetries": True,
     "epochs": 2,
-    "accumulate": 1,
     "batch_size": 2,
     "bptt_windows": 3,
     "learning_rate": 1e-3,
@@ -44,9 +43,7 @@ LOOP: dict[str, Any] = {
 }
 TRAIN = TrainConfig(**LOOP, representation="event_tensor", optimizer=None, start=None, scene_dolp=None)
 E2V = E2vConfig(**LOOP, arch="firenet", bins=5, ssim=1.0, lpips=0.0)
-NETWORK = DolpUNetConfig(
-    channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1, input_mixing="contrasts"
-)
+NETWORK = DolpUNetConfig(channels=[4, 8, 8], swin_depth=2, swin_window=4, swin_heads=[1, 2], residual_blocks=1)
 LOSS = LossConfig(mse=1.0, ssim=1.0, lpips=0.0, stokes=0.0, half_weight=None)
 
 

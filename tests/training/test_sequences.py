@@ -101,14 +101,13 @@ def test_a_dataset_in_memory_is_read_once_by_this_process_or_by_workers(stores, 
     assert not any(one.inputs.is_shared() for one in loaded)
 
 
-def test_processes_of_a_machine_share_its_memory(stores, monkeypatch):
+def test_a_dataset_is_kept_in_memory_only_if_a_share_of_it_is_enough(stores, monkeypatch):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
     needed = 2 * sum(tensor.nbytes for tensor in packed(dataset[0], True)[1:] if tensor is not None)
-    free = int(1.5 * needed / MEMORY_SHARE)  # enough for one process
-    monkeypatch.setattr("polarnet.training.engine.sequences.memory", lambda: (free, free))
-    assert loaded_if_it_fits(dataset, intensity=True, workers=1) is not None
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    assert loaded_if_it_fits(dataset, intensity=True, workers=1) is None
+    for share, fits in ((1.01, True), (0.99, False)):
+        free = int(share * needed / MEMORY_SHARE)
+        monkeypatch.setattr("polarnet.training.engine.sequences.memory", lambda free=free: (free, free))
+        assert (loaded_if_it_fits(dataset, intensity=True, workers=1) is not None) == fits
 
 
 def test_counts_of_events_are_kept_as_bytes_and_seen_as_they_were():

@@ -101,10 +101,12 @@ def test_the_loss_is_the_published_one():
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_a_record_names_its_lpips_settings_and_without_lpips_in_the_loss_no_weights_are_loaded(monkeypatch):
+def test_lpips_is_on_the_device_of_the_training_and_is_not_loaded_for_a_loss_without_it(monkeypatch):
     for baseline in BASELINES.values():
         assert set(baseline.lpips) <= set(baseline.config.__dataclass_fields__)
-    loads_nothing = dataclasses.replace(BASELINES["e2v"], lpips=(), task=lambda settings, lpips, seed: lpips)
-    monkeypatch.setattr("polarnet.training.e2v.BASELINE", loads_nothing)
-    _, lpips = train._task(load(ROOT, ["baseline=e2v"]))
-    assert lpips is None
+    gives_lpips = dataclasses.replace(BASELINES["e2v"], task=lambda settings, lpips, seed: lpips)
+    monkeypatch.setattr("polarnet.training.e2v.BASELINE", gives_lpips)
+    monkeypatch.setattr(Lpips, "load", Lpips)
+    _, lpips = train._task(load(ROOT, ["baseline=e2v"]), torch.device("meta"))
+    assert {tensor.device.type for tensor in lpips.parameters()} == {"meta"}
+    assert train._task(load(ROOT, ["baseline=e2v", "baselines.e2v.lpips=0"]), torch.device("meta"))[1] is None

@@ -1,6 +1,5 @@
 """The paper's end-to-end DoLP recovery network (section 3.3, Fig. 6)."""
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import torch
@@ -9,9 +8,9 @@ from pydantic import Field, PositiveInt
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.blocks import ConvGRU, ResidualBlock, UpBlock, compressed, contrasts, conv3x3
+from polarnet.networks.base.blocks import ConvGRU, ResidualBlock, UpBlock, conv3x3
 from polarnet.networks.paper.swin import SwinStage
-from polarnet.runtime.sections import one_of, section
+from polarnet.runtime.sections import section
 from polarnet.stokes import Prediction
 
 STRIDE = 4  # two stages halve the resolution; height and width are padded to multiples of 4
@@ -32,9 +31,6 @@ class DolpUNetConfig:
     """Attention heads of S1 and S2."""
     residual_blocks: Annotated[int, Field(ge=0, le=100)]
     """Number of residual blocks; the paper has two, R1 and R2."""
-    input_mixing: Annotated[str, one_of(("polarizers", "contrasts"))]
-    """Input of C1. polarizers: the four event tensors, as in the paper; contrasts: their sum and differences, on a
-    logarithmic scale."""
 
     def __post_init__(self):
         if len(self.channels) != 3 or len(self.swin_heads) != 2:
@@ -62,7 +58,6 @@ class DolpUNet(nn.Module):
 
     def __init__(self, config: DolpUNetConfig, in_channels: int = 4):
         super().__init__()
-        self.mix = INPUT_MIXINGS[config.input_mixing]
         full, half, quarter = config.channels
         depth, window, (heads_half, heads_quarter) = config.swin_depth, config.swin_window, config.swin_heads
         self.c1 = conv3x3(in_channels, full)
@@ -89,7 +84,7 @@ class DolpUNet(nn.Module):
     ) -> tuple[Prediction, list[Tensor]]:
         """Process t windows of b streams at once: same result as `forward` per window, in fewer operations."""
         t, b, _, height, width = inputs.shape
-        x = self.mix(inputs).flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        x = inputs.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         x = F.pad(x, (0, -width % STRIDE, 0, -height % STRIDE))  # the padding holds no events
         state1, state2 = state or (None, None)
 
@@ -100,9 +95,3 @@ class DolpUNet(nn.Module):
         dolp = self.p1(self.d1(d2, skip=c1))
         dolp = dolp[:, 0, :height, :width].float().unflatten(0, (t, b))
         return Prediction(dolp), [state1, state2]
-
-
-INPUT_MIXINGS: dict[str, Callable[[Tensor], Tensor]] = {
-    "polarizers": lambda events: events,
-    "contrasts": lambda events: compressed(contrasts(events)),
-}

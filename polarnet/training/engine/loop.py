@@ -20,7 +20,6 @@ from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.calibration import Scene, fitted, joined, weights_for
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
-from polarnet.training.engine.parallel import add_up, place, wait_for_all
 from polarnet.training.engine.recorder import Recorder
 from polarnet.training.engine.sequences import (
     Batch,
@@ -29,7 +28,6 @@ from polarnet.training.engine.sequences import (
     WindowDataset,
     batches_of,
     loaded_if_it_fits,
-    parts_of,
     shuffled,
 )
 from polarnet.training.engine.task import Split, State, Task
@@ -50,8 +48,6 @@ class LoopConfig(ViewConfig):
     epochs: Annotated[int, Field(gt=0, le=100_000)]
     batch_size: Annotated[int, Field(gt=0, le=10_000)]
     """Number of visits to sequences in one batch."""
-    accumulate: PositiveInt
-    """Number of parts that a batch is split into to save memory. The steps stay the same up to rounding."""
     bptt_windows: PositiveInt
     """Windows per optimizer step. The recurrent state passes from step to step, gradients do not."""
     learning_rate: Annotated[float, Field(gt=0, le=1)]
@@ -93,38 +89,36 @@ def train(
     """Train the task's network, or resume a killed run of the same training that the recorder holds.
 
     All random numbers derive from the seed, the epoch and the sequence's name, so neither an interruption nor the
-    number of workers (processes that read ahead) changes the weights. All processes that share a training (module
-    `parallel`) call this function; their number changes the weights by rounding only. OSError if the disk has no room
-    for the checkpoints.
+    number of workers (processes that read ahead) changes the weights. OSError if the disk has no room for the
+    checkpoints.
     """
     weights = sum(tensor.nbytes for tensor in task.network.state_dict().values())
     check_room(recorder.running, COPIES_OF_WEIGHTS * weights, "the checkpoints")
     network = task.network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     recorder.resume(network, optimizer)
-    wait_for_all()  # every process has read the running checkpoint before the first process writes it again
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
     trained = len(recorder.history) == config.epochs
     loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
     for epoch in range(len(recorder.history), config.epochs):
         visits = Visits(sequences, config, seed, epoch)
-        means = train_epoch(task, optimizer, visits, config, device, workers, show=recorder.writes)
+        means = train_epoch(task, optimizer, visits, config, device, workers)
         scores = validate(task, split.val, config, device, workers)
         recorder.end_epoch(network, optimizer, means, scores)
-    if task.unroll_with_features is not None and recorder.writes:
+    if task.unroll_with_features is not None:
         network.load_state_dict(recorder.best)
         recorder.calibrated(network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers))
     recorder.finish()
 
 
 def train_epoch(
-    task: Task, optimizer: Optimizer, visits: Visits, config: LoopConfig, device: torch.device, workers: int, show: bool
+    task: Task, optimizer: Optimizer, visits: Visits, config: LoopConfig, device: torch.device, workers: int
 ) -> dict[str, float]:
     """Return means of the loss and its terms over the steps; FloatingPointError if a loss is infinite or NaN."""
     sums, steps, done = Counter[str](), 0, 0
     order, title = shuffled(len(visits), visits.seed, visits.epoch), f"epoch {visits.epoch + 1}/{config.epochs}"
-    with ProgressBar(total=len(order), desc=title, unit="visit", disable=not show) as bar:
+    with ProgressBar(total=len(order), desc=title, unit="visit") as bar:
         for batch in batches_of(visits, order, config.batch_size, workers):
             set_learning_rate(optimizer, config, (visits.epoch + done / len(order)) / config.epochs)
             for terms in train_batch(task, optimizer, batch, config, device):
@@ -144,43 +138,22 @@ def train_epoch(
 def train_batch(
     task: Task, optimizer: Optimizer, batch: Batch, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
-    """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step.
-
-    The batch is split into parts, and this process passes its own parts through the network one after another. The loss
-    of a part is weighted by its share of all frames, over all processes, that have a valid pixel.
-    """
-    rank, processes = place()
-    parts = parts_of(batch, processes * config.accumulate)[rank::processes]
-    runs = [list(runs_of(task, part, config.bptt_windows, device)) for part in parts]
-    states: list[State] = [None] * len(parts)
+    """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step."""
+    state: State = None
     losses = []
-    for number in range(math.ceil(len(batch.inputs) / config.bptt_windows)):
+    for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
         task.network.zero_grad()
-        sums = torch.zeros(1 + len(task.loss.weights), device=device)
-        counts = [
-            frames.shape[0] * frames.shape[1] if valid is None else int(valid.flatten(2).any(-1).sum())
-            for _, frames, valid in (run[number] for run in runs)
-        ]
-        known = torch.tensor(float(sum(counts)), device=device)
-        add_up([known])
-        for part, count in enumerate(counts):
-            windows, frames, valid = runs[part][number]
-            with autocast(config.precision, device):
-                predicted, state = task.unroll(windows, states[part])
-                terms = task.loss(predicted, frames, valid)
-                total = task.loss.total(terms)
-            share = count / max(1.0, known.item())
-            (share * total).backward()
-            states[part] = [tensor.detach() for tensor in state or []]
-            sums += share * torch.stack([total, *terms.values()]).detach()
-        if processes > 1:
-            for parameter in task.network.parameters():  # another process may have a gradient that this one has not
-                parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-            add_up([*(parameter.grad for parameter in task.network.parameters() if parameter.grad is not None), sums])
+        with autocast(config.precision, device):
+            predicted, state = task.unroll(windows, state)
+            terms = task.loss(predicted, frames, valid)
+            total = task.loss.total(terms)
+        total.backward()
+        state = [tensor.detach() for tensor in state or []]
         if config.gradient_norm is not None:
             nn.utils.clip_grad_norm_(task.network.parameters(), config.gradient_norm)
         optimizer.step()
-        losses.append(dict(zip(("total", *task.loss.weights), sums.tolist(), strict=True)))
+        values = torch.stack([total, *terms.values()]).tolist()
+        losses.append(dict(zip(("total", *terms), values, strict=True)))
     return losses
 
 
@@ -204,10 +177,8 @@ def validate(
     """
     task.network.eval()
     sums, count = Counter[str](dict.fromkeys(("total", *task.loss.weights, *SCORES), 0.0)), 0
-    rank, processes = place()
-    own = range(rank, len(dataset), processes)
-    batches = batches_of(dataset, own, 1, workers)
-    for batch in ProgressBar(batches, "validation", len(own), unit="sequence", disable=rank > 0):
+    batches = batches_of(dataset, range(len(dataset)), 1, workers)
+    for batch in ProgressBar(batches, "validation", len(dataset), unit="sequence"):
         state = None
         for windows, frames, valid in runs_of(task, batch, config.bptt_windows, device):
             with autocast(config.precision, device):
@@ -220,12 +191,9 @@ def validate(
                 sums.update({name: value.item() * len(a) for name, value in scores.items()})
                 count += len(a)
     task.network.train()
-    together = torch.tensor([*sums.values(), count], dtype=torch.float64, device=device)
-    add_up([together])
-    *totals, count = together.tolist()
     if not count:
         raise ValueError(f"{dataset.frames.path}: no validation frame has a valid pixel; use other pictures")
-    return {name: value / count for name, value in zip(sums, totals, strict=True)}
+    return {name: value / count for name, value in sums.items()}
 
 
 def set_learning_rate(optimizer: Optimizer, config: LoopConfig, done: float) -> None:

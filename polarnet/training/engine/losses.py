@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from polarnet.metrics.similarity import Lpips, mean_where, mse, ssim, with_truth_outside
+from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.similarity import mean_where, mse, ssim, with_truth_outside
 from polarnet.runtime.sections import section
 
 Frames = Float[Tensor, "t b h w"]

@@ -20,7 +20,6 @@ from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.runtime.files import check_seal, claimed, code_digest, publish, replaced, seal, sha256
 from polarnet.terminal.progress import ProgressBar
 from polarnet.training.engine.optimizers import Optimizer
-from polarnet.training.engine.parallel import place
 
 HISTORY = "history.csv"
 
@@ -68,8 +67,8 @@ class Recorder:
 
     `metadata` records everything that determines the weights. It goes into the JSON of the best and last checkpoints,
     and its hash, with that of the code, names the folder of the running checkpoint. Files lie in OUT.partial until
-    `finish`, which publishes them and deletes the running checkpoint. If several processes share a training, only the
-    first one writes. ValueError while another training writes into `out`, or while an equal one runs.
+    `finish`, which publishes them and deletes the running checkpoint. ValueError while another training writes into
+    `out`, or while an equal one runs.
     """
 
     def __init__(self, out: Path, resume: Path, metadata: Mapping[str, Any]):
@@ -77,17 +76,15 @@ class Recorder:
         self.metadata = dict(metadata)
         key = sha256(json.dumps(self.metadata, sort_keys=True).encode(), code_digest().encode())
         self.running = resume / key[:16]
-        self.writes = place()[0] == 0
         self.history: list[Row] = []
         """Complete epochs."""
         self.best: dict[str, Tensor] = {}
         """Weights of the epoch with the smallest validation MSE."""
         self._claims = contextlib.ExitStack()
-        if self.writes:
-            self._claims.enter_context(claimed(out))
-            self._claims.enter_context(claimed(self.running))
-            shutil.rmtree(self.out, ignore_errors=True)
-            self.out.mkdir(parents=True)
+        self._claims.enter_context(claimed(out))
+        self._claims.enter_context(claimed(self.running))
+        shutil.rmtree(self.out, ignore_errors=True)
+        self.out.mkdir(parents=True)
 
     def resume(self, network: nn.Module, optimizer: Optimizer) -> None:
         """Restore everything from the running checkpoint, if there is one; ValueError if it is damaged."""
@@ -99,8 +96,7 @@ class Recorder:
         optimizer.load_state_dict(content["optimizer"])
         self.history, self.best = content["history"], content["best"]
         ProgressBar.write(f"resuming after epoch {len(self.history)}, from {file}")
-        if self.writes:
-            self._write(network)  # __init__ emptied `out`
+        self._write(network)  # __init__ emptied `out`
 
     def end_epoch(
         self, network: nn.Module, optimizer: Optimizer, means: Mapping[str, float], scores: Mapping[str, float]
@@ -109,8 +105,6 @@ class Recorder:
         self.history.append({"epoch": len(self.history), "train": dict(means), "val": dict(scores)})
         if best_row(self.history) is self.history[-1]:
             self.best = {name: tensor.detach().cpu().clone() for name, tensor in network.state_dict().items()}
-        if not self.writes:
-            return
         ProgressBar.write("  validation: " + "  ".join(f"{name} {value:.4f}" for name, value in scores.items()))
         self._write(network)
         states = {"network": network.state_dict(), "optimizer": optimizer.state_dict()}
@@ -125,10 +119,9 @@ class Recorder:
 
     def finish(self) -> None:
         """Publish the files and delete the running checkpoint, because the training is complete."""
-        if self.writes:
-            publish(self.out, self.place)
-            shutil.rmtree(self.running, ignore_errors=True)
-            self._claims.close()
+        publish(self.out, self.place)
+        shutil.rmtree(self.running, ignore_errors=True)
+        self._claims.close()
 
     def _write(self, network: nn.Module) -> None:
         self._save("last", network.state_dict(), self.history[-1])

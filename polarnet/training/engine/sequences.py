@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from polarnet.events.representations import Encode
 from polarnet.events.streaming import encode_windows
-from polarnet.runtime.machine import generator_for, memory, memory_handed_back, processes_here
+from polarnet.runtime.machine import generator_for, memory, memory_handed_back
 from polarnet.runtime.sections import section
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
@@ -165,7 +165,7 @@ def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> 
     `workers` processes read and encode them; 0 or 1: this process. `intensity` says whether to keep the intensity.
     """
     bytes_each = sum(tensor.nbytes for tensor in packed(dataset[0], intensity)[1:] if tensor is not None)
-    if bytes_each * len(dataset) * processes_here() > MEMORY_SHARE * memory()[0]:
+    if bytes_each * len(dataset) > MEMORY_SHARE * memory()[0]:
         return None
     workers = workers if workers > 1 else 0
     packing = functools.partial(packed, intensity=intensity)
@@ -195,14 +195,6 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     valid = None if masks[0] is None else torch.stack(masks, dim=1)  # one store: masks for all or none
     inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
     return Batch(list(names), inputs, dolp, aolp, intensity, valid)
-
-
-def parts_of(batch: Batch, parts: int) -> list[Batch]:
-    """Split a batch into `parts` parts of nearly equal size, or into single visits if it has fewer visits."""
-    parts = min(parts, len(batch.names))
-    names = [part.tolist() for part in np.array_split(batch.names, parts)]
-    fields = [[None] * parts if field is None else field.tensor_split(parts, dim=1) for field in batch[1:]]  # type: ignore
-    return [Batch(*part) for part in zip(names, *fields, strict=True)]
 
 
 def shuffled(count: int, seed: int, epoch: int) -> list[int]:
