@@ -179,7 +179,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
 
     from polarnet.config.tree import load
     from polarnet.simulation.camera import Camera
-    from polarnet.simulation.dataset import emulate_scenes
+    from polarnet.simulation.event_sets import emulate_scenes
     from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
     from polarnet.simulation.truth import frames_of

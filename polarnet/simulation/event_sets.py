@@ -1,4 +1,4 @@
-"""Emulation of a scene store: into an event store, part by part so that a run can resume."""
+"""Event sets: every sequence of a scene store, emulated into an event store part by part, so that a run can resume."""
 
 import functools
 from collections.abc import Callable, Iterable
