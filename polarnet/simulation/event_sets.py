@@ -69,4 +69,4 @@ def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, T
     stored = scenes.read(sequence)
     scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
     scene = stretched(scene, scenes.dynamic_range(sequence))
-    return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
+    return scene, Trajectory.from_record(scenes.trajectory(sequence)), scenes.duration_us(sequence)

@@ -158,7 +158,7 @@ def _create(
         attributes["crosstalk"] = crosstalk
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
-    scene_store = SceneStore.create(scenes, contents, scene_of, sensor, Trajectory.vector_names())
+    scene_store = SceneStore.create(scenes, contents, scene_of, sensor)
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
     size = channel_size(synthesis.polarizers.layout, *sensor)
     frame_store = FrameStore.create(frames, contents, *size)
@@ -176,7 +176,7 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
             planes = planes._replace(valid=None)
         scene = stretched(scene_from_polarization(planes.s0, planes.dolp, planes.aolp), dynamic_range)
         for sequence, *_, trajectory in over_scene:
-            scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1], dynamic_range)
+            scenes.write(sequence, planes, asdict(trajectory), t_us[-1], dynamic_range)
             if planes.valid is not None:
                 valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.max_crosstalk)
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
