@@ -157,11 +157,6 @@ def grid(layout: str, height: int, width: int) -> Grid:
     return Grid(height // 2, width // 2, 2)
 
 
-def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a channel of a sensor; ValueError as `grid`."""
-    return grid(layout, height, width)[:2]
-
-
 def weights_of(
     polarizers: PolarizersConfig, height: int, width: int, key: int
 ) -> Float32[np.ndarray, "sensors 3 *pixels"]:
@@ -224,13 +219,14 @@ def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np
     return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])
 
 
-def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
-    """The events of one sensor as they leave it, in time order, and the number of events lost on the bus.
+def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> Events:
+    """The events of one sensor as they leave it, in time order.
 
-    `key` (modulo 2^64) seeds the jitter. Events that would leave after `duration_us` are missing.
+    `key` (modulo 2^64) seeds the jitter. Events lost on the bus are missing, and those that would leave after
+    `duration_us`.
     """
     if config.perfect or len(events) == 0:
-        return events, 0
+        return events
     forget_stale_code(Path(__file__).parent)
     t, y = events.t.numpy(), events.y.numpy()
     times_us = t + config.row_latency_us * y
@@ -244,8 +240,7 @@ def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) 
         times_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
     stamps = np.rint(times_us).astype(np.int64)
     left = carried & (stamps <= duration_us)
-    leaving = replace(select(events, torch.from_numpy(order[left])), t=torch.from_numpy(stamps[left]))
-    return leaving, int((~carried).sum())
+    return replace(select(events, torch.from_numpy(order[left])), t=torch.from_numpy(stamps[left]))
 
 
 @compiled

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from polarnet.events.stream import Events
-from polarnet.simulation.camera import Camera, channel_size, pixel_analyzers
+from polarnet.simulation.camera import Camera, grid, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
@@ -32,9 +32,9 @@ def emulate_scenes(
     camera, depend only on the seed and the sequence's name.
     """
     source = SceneStore.open(scenes)
-    size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
+    height, width, _ = grid(camera.polarizers.layout, source.sensor_height, source.sensor_width)
     store = EventStore.create(
-        events, source.sequences, *size, origin_of(source, camera, seed), source.sequences_per_part
+        events, source.sequences, height, width, origin_of(source, camera, seed), source.sequences_per_part
     )
     return fill_store(store, functools.partial(_emulated, source, camera, seed, threads), mapper)
 

@@ -16,7 +16,7 @@ from polarnet.events.stream import Events
 from polarnet.simulation.camera import (
     Camera,
     PolarizersConfig,
-    channel_size,
+    grid,
     mixed_with_neighbours,
     read_out,
     split_cells,
@@ -68,8 +68,8 @@ def leave_sensors(channels: list[Events], camera: Camera, duration_us: int) -> l
         return channels
     if camera.polarizers.layout == "dofp":
         mosaic = parse_mosaic(camera.polarizers.mosaic)
-        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us)[0], mosaic)
-    return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
+        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us), mosaic)
+    return [read_out(channel, readout, key + number, duration_us) for number, channel in enumerate(channels)]
 
 
 def emulate_motion_steps(
@@ -98,7 +98,7 @@ def emulate_motion_steps(
 
 def channels_of(camera: Camera, size: Size) -> Channels:
     """The four channels of a camera with sensors of this size."""
-    return Channels(NUMBERS, *channel_size(camera.polarizers.layout, *size), camera.sensor, camera.key)
+    return Channels(NUMBERS, *grid(camera.polarizers.layout, *size)[:2], camera.sensor, camera.key)
 
 
 def checked_pose(scene: PolarizationScene, trajectory: Trajectory, t_us: Times, size: Size, pitch: int = 1) -> Pose:

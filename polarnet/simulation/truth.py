@@ -20,7 +20,7 @@ from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation import scene as scene_module
-from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, channel_size, grid, mixed_with_neighbours
+from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, grid, mixed_with_neighbours
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import (
     LIGHT_RANGE,
@@ -160,8 +160,8 @@ def _create(
     sensor = config.sensor_height, config.sensor_width
     scene_store = SceneStore.create(scenes, contents, scene_of, sensor)
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
-    size = channel_size(synthesis.polarizers.layout, *sensor)
-    frame_store = FrameStore.create(frames, contents, *size)
+    height, width, _ = grid(synthesis.polarizers.layout, *sensor)
+    frame_store = FrameStore.create(frames, contents, height, width)
     return scene_store, frame_store
 
 
