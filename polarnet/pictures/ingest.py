@@ -25,7 +25,6 @@ from polarnet.pictures.polarimetry import group_by_measurement, parse_raw_mosaic
 from polarnet.runtime.files import claimed, publish, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.runtime.splits import SPLITS
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +115,7 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
 
 def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mapper) -> Manifest:
     """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
-    sources, ignored, dead = _find_pictures(Path(config.root), config.source)
+    sources, ignored = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
     limit = config.limit or len(sources)
@@ -132,30 +131,24 @@ def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mappe
         raise ValueError(
             f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
             f"{', '.join(sorted(_extensions(config.source)))}: found {len(sources)} pictures and {ignored} other files."
-            f"{listed([*skipped, *dead])}"
+            f"{listed(skipped)}"
         )
-    manifest = _manifest(_split(config, entries), [*skipped, *dead], folder)
+    manifest = _manifest(_split(config, entries), skipped, folder)
     return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
 
 
-def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipped]]:
-    """Files under `root` with a picture's extension, by path, the number of other files, and the dead links."""
+def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
+    """Files under `root` with a picture's extension, by path, and the number of other files."""
     if not root.is_dir():
         raise ValueError(f"ingest.root: expected a folder with pictures, got {root}; see ingest.source")
-    paths = files_under(root)
-    files = [path for path in paths if path.is_file()]
-    dead = [
-        Skipped(_relative(path, root), "a dead link: its target does not exist; restore it or remove the link")
-        for path in paths
-        if path.is_symlink() and not path.exists()
-    ]
+    files = [path for path in files_under(root) if path.is_file() or path.is_symlink()]  # a dead link is skipped later
     pictures = [path for path in files if extension(path) in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
     sources = []
     for group in groups:
         stem = group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0]
         sources.append(Source(group, kind, stem, ", ".join(_relative(path, root) for path in group)))
-    return sources, len(files) - len(pictures), dead
+    return sources, len(files) - len(pictures)
 
 
 def files_under(root: Path) -> list[Path]:
@@ -300,12 +293,6 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
     for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
         if fraction > 0 and not manifest.counts[split]:
             logger.warning("split %s is empty, because %d pictures are too few", split, len(manifest.pictures))
-    if config.source != "builtin" and config.limit is not None and len(manifest.pictures) < config.limit:
-        counts = ", ".join(f"{manifest.counts[split]} {split}" for split in SPLITS)
-        logger.warning(
-            "ingest.limit=%d: the folder has only %d usable pictures, split into %s; for other numbers change "
-            "ingest.val_fraction and ingest.test_fraction", config.limit, len(manifest.pictures), counts,
-        )  # fmt: skip
 
 
 def _slug(stem: str) -> str:
