@@ -88,8 +88,8 @@ def test_exact_fires_a_delayed_event_when_the_refractory_period_ends_unless_the_
 @pytest.mark.parametrize("share", [0.0, 0.1])
 @pytest.mark.parametrize("model", list(MODELS))
 def test_pieces_threads_and_the_order_of_channels_change_no_event(model, share):
-    """Of valid events in the order (t, y, x, p), from sensors with and without hot and dead pixels."""
-    config = of(model, NOISY, hot_pixel_share=share, hot_pixel_rate_hz=500.0, dead_pixel_share=share)
+    """Of valid events in the order (t, y, x, p), from sensors with and without hot pixels."""
+    config = of(model, NOISY, hot_pixel_share=share, hot_pixel_rate_hz=500.0)
     frames, t_us = moving_bars(), 3333.5 * torch.arange(12, dtype=torch.float64)
     whole, end = emulate(frames, t_us, config, key=7)
     assert sum(map(len, whole)) > 2000
