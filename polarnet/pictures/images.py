@@ -45,7 +45,6 @@ class Picture:
     pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; float: 1.0 is white
     profile: bytes | None  # embedded ICC profile
     colour_space: str  # OpenImageIO's name of the encoding; means nothing beside a profile
-    profile_name: str | None
     author: str | None
     licence: str | None
 
@@ -89,7 +88,6 @@ def read_picture(path: str | os.PathLike[str]) -> Picture:
         pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, spec.alpha_channel)]),
         profile=None if profile is None else np.asarray(profile, dtype=np.uint8).tobytes(),
         colour_space=_colour_space(spec, file_format),
-        profile_name=spec.get_string_attribute("ICCProfile:profile_description") or None,
         author=spec.get_string_attribute("Artist") or None,
         licence=spec.get_string_attribute("Copyright") or None,
     )

@@ -28,7 +28,6 @@ from polarnet.runtime.sections import one_of, section
 
 logger = logging.getLogger(__name__)
 
-LIGHT_BITS = 32  # of a channel of a picture of light
 EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
@@ -200,16 +199,15 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
         rgb = fitted if light else images.srgb_of(fitted, picture)
     except UnreadablePicture as error:
         return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
-    file, bits = f"source-{number:08d}{images.LIGHT if light else '.png'}", LIGHT_BITS if light else picture.bits
+    file = f"source-{number:08d}{images.LIGHT if light else '.png'}"
     if light:
         np.save(folder / file, rgb)
     else:
-        write_png(folder / file, rgb, bits)
+        write_png(folder / file, rgb, picture.bits)
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{picture.sha256[:8]}", file=file, source=source.kind, origin=source.origin,
         licence=source.licence or picture.licence, author=source.author or picture.author, sha256=picture.sha256,
-        bits=bits, height=config.height, width=config.width, source_height=picture.pixels.shape[0],
-        source_width=picture.pixels.shape[1], colour_profile=picture.profile_name,
+        height=config.height, width=config.width,
     )  # fmt: skip
 
 
@@ -229,12 +227,11 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     file = f"source-{number:08d}.npz"
     polarimetry.write_intensities(folder / file, shrunk)
     digest = sha256(measured.intensities.tobytes(), measured.valid.tobytes())
-    (height, width), (source_height, source_width) = shrunk.valid.shape, measured.valid.shape
+    height, width = shrunk.valid.shape
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{digest[:8]}", file=file, source=source.kind, origin=source.origin, sha256=digest,
-        bits=16, height=height, width=width, source_height=source_height, source_width=source_width,
-        residual=round(measured.residual, 6), saturated_fraction=round(measured.saturated, 6),
-        masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
+        height=height, width=width, residual=round(measured.residual, 6),
+        saturated_fraction=round(measured.saturated, 6), masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
     )  # fmt: skip
 
 
@@ -248,8 +245,7 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
     return ManifestEntry(
         name=f"{stem}-{digest[:8]}", file=f"{stem}.png", source="dead_leaves", origin=f"generated from seed {seed}",
-        licence="CC0-1.0", author="polarnet", sha256=digest, bits=8, height=config.height, width=config.width,
-        source_height=config.height, source_width=config.width,
+        licence="CC0-1.0", author="polarnet", sha256=digest, height=config.height, width=config.width,
     )  # fmt: skip
 
 

@@ -26,12 +26,8 @@ class ManifestEntry:
     licence: str | None = None
     author: str | None = None
     sha256: str  # hash of the source's upright pixels, before cropping, scaling and conversion
-    bits: int
     height: int
     width: int
-    source_height: int
-    source_width: int
-    colour_profile: str | None = None  # colour space of the source, if it was converted to sRGB
     residual: float | None = None  # median of |I0 + I90 - I45 - I135| / S0 (measured polarization)
     saturated_fraction: float | None = None  # share of source pixels with a saturated angle (measured polarization)
     masked_fraction: float | None = None
