@@ -28,7 +28,6 @@ from polarnet.simulation.pixels.light import FULL_SCALE, Light
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import parse_mosaic
 
-NUMBERS = (0, 1, 2, 3)  # of the channels behind the polarizers at 0, 45, 90 and 135 degrees
 Size = tuple[int, int]
 Times = Int64[np.ndarray, " _n"]
 Reals = Float64[np.ndarray, " _n"]
@@ -98,7 +97,7 @@ def emulate_motion_steps(
 
 def channels_of(camera: Camera, size: Size) -> Channels:
     """The four channels of a camera with sensors of this size."""
-    return Channels(NUMBERS, *grid(camera.polarizers.layout, *size)[:2], camera.sensor, camera.key)
+    return Channels(*grid(camera.polarizers.layout, *size)[:2], camera.sensor, camera.key)
 
 
 def checked_pose(scene: PolarizationScene, trajectory: Trajectory, t_us: Times, size: Size, pitch: int = 1) -> Pose:

@@ -68,7 +68,7 @@ def emulate_rotating(
     pose = checked_pose(scene, trajectory, t_us, size, pixels.pitch)
     rendered = rendered_chunks(scene, pose, t_us, size)
     frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
-    (events,), _ = emulate_frames(Channels((0,), *size, sensor, camera.key), frames)
+    (events,), _ = emulate_frames(Channels(*size, sensor, camera.key), frames)
     return read_out(events, camera.readout, camera.key, duration_us)
 
 
