@@ -150,7 +150,8 @@ def emulate(
     _check_frames(frames, times, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
     lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in clip.swapaxes(0, 1)]
-    return emulate_lights(Channels(*clip.shape[2:], config, key), lights, times, state, threads)
+    height, width = clip.shape[2:]
+    return emulate_lights(Channels(height, width, config, key), lights, times, state, threads)
 
 
 def emulate_frames(

@@ -82,7 +82,7 @@ def test_good_files_come_in_and_bad_ones_are_named(mixed_folder, tmp_path, caplo
     text = (tmp_path / "images" / "manifest.json").read_text()
     assert str(tmp_path) not in text  # no place of this machine
     content = json.loads(text)
-    assert set(content) == {"pictures", "skipped", "counts"}
+    assert set(content) == {"pictures", "skipped", "ignored_files", "unread_files"}
     entry = content["pictures"][0]
     assert (entry["name"], entry["file"]) == (f"deep-{entry['sha256'][:8]}", f"{entry['name']}.png")
     assert (entry["height"], entry["width"]) == (100, 150)
