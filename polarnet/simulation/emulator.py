@@ -65,7 +65,7 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, RandomisedConfig):
+class EmulatorConfig(esim.EsimConfig, DefectsConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn

@@ -9,7 +9,7 @@ from polarnet.runtime.sections import section
 
 LOGARITHMIC = ("_hz", "_per_s", "extinction_ratio")
 """Name suffixes of the parameters whose logarithm is drawn uniformly: rates, bandwidths, ratios."""
-NAMES = ("model", "voltmeter_camera", "refractory")
+NAMES = ("model", "refractory")
 """Parameters that are one of several names, each listed name as likely as the others."""
 
 
