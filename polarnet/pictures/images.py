@@ -147,15 +147,15 @@ def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[
     return converted(np.round(255 * rgb).astype(np.uint8)).astype(np.float32) / 255
 
 
-def code_fractions(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+def code_fractions(pixels: Shaped[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "h w *c"]:
     """Code values as fractions of white: integers become [0, 1]."""
     white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
     return pixels.astype(np.float32) / np.float32(white)
 
 
 def fit(
-    pixels: Shaped[np.ndarray, "h w c"], height: int, width: int, max_upscale: float
-) -> Float32[np.ndarray, "height width c"]:
+    pixels: Shaped[np.ndarray, "h w *c"], height: int, width: int, max_upscale: float
+) -> Float32[np.ndarray, "height width *c"]:
     """Cut out the largest centred part of shape height:width and scale it to that size; integers become [0, 1].
 
     Shrinks by averaging areas, enlarges by cubic interpolation, without decoding the pixels to linear light.

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
-from polarnet.pictures.images import UnreadablePicture, extension, read_channels
+from polarnet.pictures.images import UnreadablePicture, extension, fit, read_channels
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0{0,2}(?P<angle>0|45|90|135)")
@@ -162,18 +161,12 @@ def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
 
     A pixel is valid if all pixels that it averages are valid.
     """
-    rows, columns = measurement.valid.shape
-    part_height, part_width = min(rows, round(columns * height / width)), min(columns, round(rows * width / height))
-    if part_height < height or part_width < width:
+    planes = *measurement.intensities, ~measurement.valid
+    try:
+        *intensities, invalid = (fit(plane, height, width, max_upscale=1.0) for plane in planes)
+    except UnreadablePicture:
         return measurement
-    top, left = (rows - part_height) // 2, (columns - part_width) // 2
-    part = np.s_[top : top + part_height, left : left + part_width]
-
-    def scaled(plane: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
-        return cv2.resize(plane[part].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-
-    intensities = np.stack([scaled(plane) for plane in measurement.intensities])
-    return replace(measurement, intensities=intensities, valid=scaled(~measurement.valid) == 0)
+    return replace(measurement, intensities=np.stack(intensities), valid=invalid == 0)
 
 
 def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
