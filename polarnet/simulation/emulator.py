@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, Shaped
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate
@@ -18,8 +18,9 @@ from polarnet.runtime.compilation import forget_stale_code
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
-from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
+from polarnet.simulation.pixels.defects import Defects, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ
 from polarnet.simulation.ranges import RandomisedConfig
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
@@ -65,7 +66,7 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(esim.EsimConfig, DefectsConfig, RandomisedConfig):
+class EmulatorConfig(esim.EsimConfig, RandomisedConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
@@ -80,6 +81,10 @@ class EmulatorConfig(esim.EsimConfig, DefectsConfig, RandomisedConfig):
     model: Annotated[str, one_of(MODELS)]
     render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
+    hot_pixel_share: Annotated[float, Field(ge=0, le=1)]
+    """Probability that a pixel is hot: it fires at random times, whatever its light, in every model."""
+    hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
+    """Events per second of a hot pixel, ON and OFF together; 0: it is dead."""
 
     def __post_init__(self):
         esim.EsimConfig.__post_init__(self)
@@ -194,7 +199,7 @@ def emulate_lights(
     empty = [empty_columns(room) for _ in lights]
 
     def emulate_channel(i: int) -> tuple[list[Tensor], Any]:
-        defects = defects_of(config, height * width, seed, i, round_up=model is v2e)
+        defects = defects_of(config.hot_pixel_share, config.hot_pixel_rate_hz, height * width, seed, i, model is v2e)
         steps = Steps(physics, height, width, times, first_frame, first_number, seed, i, defects)
         if state is None:
             pixels = model.initial(height, width, physics, seed, i)

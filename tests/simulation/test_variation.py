@@ -118,7 +118,7 @@ def test_rates_are_uniform_in_their_logarithm_and_a_draw_depends_on_seed_and_seq
     [
         ({"cutoff_hz": [300.0, 30.0]}, r"^randomise.cutoff_hz: expected \[lowest, highest\], got \[300.0, 30.0\]$"),
         ({"cutof_hz": [30.0, 300.0]}, r"^randomise.cutof_hz: expected one of .*, cutoff_hz, .*, got 'cutof_hz'$"),
-        ({"randomise": [0.0, 1.0]}, r"^randomise.randomise: expected one of hot_pixel_share, "),
+        ({"randomise": [0.0, 1.0]}, r"^randomise.randomise: expected one of knee_dn, "),
         ({"cutoff_hz": [0.0, 300.0]}, r"^randomise.cutoff_hz: expected a lowest value > 0, .* logarithm is drawn$"),
         ({"leak_jitter": [0.0, 1.5]}, r"^randomise.leak_jitter: expected <= 1, got 1.5$"),
         ({"model": ["exact", "mine"]}, r"^randomise.model: expected one of v2e, exact.*, got 'mine'"),
