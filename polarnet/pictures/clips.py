@@ -124,13 +124,8 @@ def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, 
 
 def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3 h w"]:
     """sRGB code values, or light as shares of `white` (`images.light_of`); a picture with one channel is grey."""
-    (path,) = paths
-    light, channels = images.holds_light(path), images.read_channels(path)
-    if channels.shape[2] == 1:
-        grey = np.repeat(channels, 3, axis=2)
-        return (images.light_of(grey, white) if light else code_fractions(grey)).transpose(2, 0, 1)
-    picture = images.read_picture(path)
-    if light:
+    picture = images.read_picture(paths[0], grey=True)
+    if picture.light:
         return images.light_of(picture.pixels, white).transpose(2, 0, 1)
     return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 

@@ -193,14 +193,14 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     """
     number, source = item
     try:
-        picture, light = images.read_picture(source.files[0]), images.holds_light(source.files[0])
-        pixels = images.light_of(picture.pixels) if light else picture.pixels
+        picture = images.read_picture(source.files[0])
+        pixels = images.light_of(picture.pixels) if picture.light else picture.pixels
         fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
-        rgb = fitted if light else images.srgb_of(fitted, picture)
+        rgb = fitted if picture.light else images.srgb_of(fitted, picture)
     except UnreadablePicture as error:
         return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
-    file = f"source-{number:08d}{images.LIGHT if light else '.png'}"
-    if light:
+    file = f"source-{number:08d}{images.LIGHT if picture.light else '.png'}"
+    if picture.light:
         np.save(folder / file, rgb)
     else:
         write_png(folder / file, rgb, picture.bits)

@@ -232,7 +232,7 @@ def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
     missing = [angle for angle in POLARIZER_ANGLES_DEG if angle not in by_angle]
     if missing:
         raise UnreadablePicture(f"no file for {', '.join(f'_{angle}' for angle in missing)} beside {files[0].name}")
-    pictures = [read_channels(by_angle[angle], as_stored=True) for angle in POLARIZER_ANGLES_DEG]
+    pictures = [read_channels(by_angle[angle]) for angle in POLARIZER_ANGLES_DEG]
     planes = [picture[..., 1 if picture.shape[2] >= 3 else 0] for picture in pictures]
     return _stacked(planes, [by_angle[angle].name for angle in POLARIZER_ANGLES_DEG])
 
@@ -240,7 +240,7 @@ def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
 def read_raw(paths: Sequence[Path]) -> Shaped[np.ndarray, "1 h w"]:
     """Code values of the one file of a raw mosaic; raises as `read_measurement`."""
     (path,) = paths
-    pixels = read_channels(path, as_stored=True)
+    pixels = read_channels(path)
     if pixels.shape[2] != 1:
         raise UnreadablePicture(
             f"{pixels.shape[2]} channels: neither a raw mosaic nor one of NAME_0, NAME_45, NAME_90, NAME_135"
