@@ -66,7 +66,7 @@ def _emulated(scenes: SceneStore, camera: Camera, seed: int, threads: int, seque
 
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:
     """The scene of a stored sequence, the motion over it, and its duration in microseconds."""
-    stored = scenes.read(sequence)
+    stored, record = scenes.read(sequence), scenes.record(sequence)
     scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-    scene = stretched(scene, scenes.dynamic_range(sequence))
-    return scene, Trajectory.from_record(scenes.trajectory(sequence)), scenes.duration_us(sequence)
+    scene = stretched(scene, record.get("dynamic_range"))
+    return scene, Trajectory.from_record(record["trajectory"]), record["duration_us"]

@@ -22,6 +22,7 @@ CONVENTIONS = {
     "picture_size": "height and width of a scene in pixels",
     "trajectory": "how the sensor moves in a sequence, as polarnet.simulation.motion.Trajectory",
     "duration_us": "length of a sequence in microseconds",
+    "dynamic_range": "brightest over darkest light of a scene whose s0 is logarithmic; missing: s0 is the light itself",
 }
 
 
@@ -107,18 +108,6 @@ class SceneStore(SplitStore):
         size = self.record(sequence)["picture_size"]
         (columns,) = self.read_columns(sequence, [*PLANES, *["valid"] * self.masked])
         return Polarization(**{name: dequantise(name, pixels.reshape(size)) for name, pixels in columns.items()})
-
-    def trajectory(self, sequence: str) -> dict[str, Any]:
-        """How the sensor moves: the fields of `polarnet.simulation.motion.Trajectory`."""
-        return self.record(sequence)["trajectory"]
-
-    def duration_us(self, sequence: str) -> int:
-        """Length of a sequence in microseconds."""
-        return self.record(sequence)["duration_us"]
-
-    def dynamic_range(self, sequence: str) -> float | None:
-        """Brightest over darkest light of a scene whose S0 is logarithmic; None if S0 is the light itself."""
-        return self.record(sequence).get("dynamic_range")
 
     def _pixels(self, name: str, scene: Polarization) -> dict[str, np.ndarray]:
         """The columns of a scene; ValueError for a scene that the store cannot hold."""

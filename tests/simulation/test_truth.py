@@ -74,7 +74,7 @@ def test_the_stored_truth_of_each_picture_is_that_of_its_scene_and_follows_equat
     for sequence in scenes.sequences[:3]:
         record = scenes.read(sequence)
         scene = scene_from_polarization(record.s0, record.dolp, record.aolp)
-        trajectory = Trajectory.from_record(scenes.trajectory(sequence))
+        trajectory = Trajectory.from_record(scenes.record(sequence)["trajectory"])
         intensity, degree, angle = frames_of(scene, trajectory, t_us, 24, 36)
         stored = frames.frames(sequence)
         assert stored.t_us.tolist() == t_us

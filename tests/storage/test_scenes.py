@@ -39,11 +39,12 @@ def finished(tmp_path_factory):
 def test_a_sequence_comes_back_with_its_picture_and_its_exact_trajectory(finished):
     store, (s0, dolp, aolp, _) = SceneStore.open(finished), SCENES["leaves"]
     read = store.read("leaves-0")
-    assert (store.scene_of["leaves-0"], store.duration_us("leaves-0")) == ("leaves", 1_000_002)
+    record = store.record("leaves-0")
+    assert (store.scene_of["leaves-0"], record["duration_us"]) == ("leaves", 1_000_002)
     assert (store.sensor_height, store.sensor_width) == (8, 12)
     assert (store.of_split("train"), store.attributes) == (["coffee-0", "coffee-1"], {"seed": 1})
     assert all(torch.equal(a, b) for a, b in zip(read[:3], as_stored(SCENES["leaves"])[:3], strict=True))
-    assert store.trajectory("leaves-0") == {"x": math.pi, "y": [2, -1e-300]}
+    assert record["trajectory"] == {"x": math.pi, "y": [2, -1e-300]}
     torch.testing.assert_close(read.s0, s0, atol=0.51 / 65535, rtol=0)
     torch.testing.assert_close(read.dolp, dolp, atol=0.51 / 65535, rtol=0)
     torch.testing.assert_close(read.aolp, aolp, atol=0.51 * math.pi / 65536, rtol=0)
