@@ -23,7 +23,7 @@ from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.ranges import RandomisedConfig, draws
+from polarnet.simulation.ranges import draws
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 Value = TypeVar("Value")
@@ -32,7 +32,7 @@ MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8
 
 
 @section
-class PolarizersConfig(RandomisedConfig):
+class PolarizersConfig:
     """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
 
     layout: Annotated[str, one_of(("four_sensors", "dofp"))]
@@ -58,7 +58,6 @@ class PolarizersConfig(RandomisedConfig):
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
     def __post_init__(self):
-        super().__post_init__()
         parse_mosaic(self.mosaic)
         if self.crosstalk and self.layout != "dofp":
             raise ValueError(f"crosstalk: expected 0 with layout {self.layout}, got {self.crosstalk}")
@@ -69,21 +68,16 @@ class PolarizersConfig(RandomisedConfig):
         spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
         return self.layout == "four_sensors" and not spread
 
-    @property
-    def max_crosstalk(self) -> float:
-        """Largest crosstalk that a sequence may draw."""
-        return max(self.crosstalk, *map(float, (self.randomise or {}).get("crosstalk", [0.0])))
-
 
 IDEAL = PolarizersConfig(
     layout="four_sensors", mosaic="90 45 / 135 0", extinction_ratio=[None] * NUM_CHANNELS,
     angle_error_deg=[0.0] * NUM_CHANNELS, transmission=[1.0] * NUM_CHANNELS, extinction_spread=0.0,
-    angle_spread_deg=0.0, transmission_spread=0.0, crosstalk=0.0, randomise=None,
+    angle_spread_deg=0.0, transmission_spread=0.0, crosstalk=0.0,
 )  # fmt: skip
 
 
 @section
-class ReadoutConfig(RandomisedConfig):
+class ReadoutConfig:
     """Section `readout` of params.yaml: how events leave the sensor."""
 
     row_latency_us: NonNegativeFloat
@@ -101,7 +95,7 @@ class ReadoutConfig(RandomisedConfig):
         return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
 
 
 @dataclass(frozen=True)
@@ -121,23 +115,19 @@ class Camera:
     @property
     def sections(self) -> dict[str, Any]:
         """The sections by name."""
-        return {name: asdict(section) for name, section in self._sections.items()}
+        return {
+            "emulate": asdict(self.sensor), "polarizers": asdict(self.polarizers), "readout": asdict(self.readout),
+        }  # fmt: skip
 
     def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
         """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
-        values = {name: draws(section, seed, sequence) for name, section in self._sections.items()}
-        return {name: drawn for name, drawn in values.items() if drawn}
+        drawn = draws(self.sensor, seed, sequence)
+        return {"emulate": drawn} if drawn else {}
 
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""
-        sensor, polarizers, readout = (
-            replace(section, **draws(section, seed, sequence), randomise=None) for section in self._sections.values()
-        )
-        return Camera(sensor, polarizers, readout, seed_for(seed, sequence, purpose))
-
-    @property
-    def _sections(self) -> dict[str, Any]:
-        return {"emulate": self.sensor, "polarizers": self.polarizers, "readout": self.readout}
+        sensor = replace(self.sensor, **draws(self.sensor, seed, sequence), randomise=None)
+        return replace(self, sensor=sensor, key=seed_for(seed, sequence, purpose))
 
 
 class Grid(NamedTuple):

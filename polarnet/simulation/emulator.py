@@ -21,7 +21,7 @@ from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns
 from polarnet.simulation.pixels.defects import Defects, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
 from polarnet.simulation.pixels.physics import MAX_RATE_HZ
-from polarnet.simulation.ranges import RandomisedConfig
+from polarnet.simulation.ranges import check_ranges
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
@@ -66,7 +66,7 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(esim.EsimConfig, RandomisedConfig):
+class EmulatorConfig(esim.EsimConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
@@ -85,10 +85,15 @@ class EmulatorConfig(esim.EsimConfig, RandomisedConfig):
     """Probability that a pixel is hot: it fires at random times, whatever its light, in every model."""
     hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Events per second of a hot pixel, ON and OFF together; 0: it is dead."""
+    randomise: dict[str, list[float | str]] | None
+    """Draws of each sequence: [lowest, highest] of a number, or the names that a parameter of `ranges.NAMES` may take.
+
+    A name that is listed twice is drawn twice as often. null: nothing is drawn.
+    """
 
     def __post_init__(self):
-        esim.EsimConfig.__post_init__(self)
-        RandomisedConfig.__post_init__(self)
+        super().__post_init__()
+        check_ranges(self)
         for name, off in OFF.items():
             value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
             if value != off and self.model not in having:

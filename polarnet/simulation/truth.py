@@ -154,8 +154,8 @@ def _create(
     splits = {motion.sequence: motion.split for motion in motions}
     variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
-    if masked and (crosstalk := synthesis.polarizers.max_crosstalk):
-        attributes["crosstalk"] = crosstalk
+    if masked and synthesis.polarizers.crosstalk:
+        attributes["crosstalk"] = synthesis.polarizers.crosstalk
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
     scene_store = SceneStore.create(scenes, contents, scene_of, sensor)
@@ -178,7 +178,7 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
         for sequence, *_, trajectory in over_scene:
             scenes.write(sequence, planes, asdict(trajectory), t_us[-1], dynamic_range)
             if planes.valid is not None:
-                valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.max_crosstalk)
+                valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.crosstalk)
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 

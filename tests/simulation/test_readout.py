@@ -9,7 +9,7 @@ import torch
 from polarnet.events.stream import Events, validate
 from polarnet.simulation.camera import ReadoutConfig, read_out
 
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=1000.0, randomise=None)
+PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=1000.0)
 
 
 def events_at(*rows: tuple[int, int, int], height: int = 10, width: int = 10) -> Events:
