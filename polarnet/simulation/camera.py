@@ -80,22 +80,13 @@ IDEAL = PolarizersConfig(
 class ReadoutConfig:
     """Section `readout` of params.yaml: how events leave the sensor."""
 
-    row_latency_us: NonNegativeFloat
-    """Delay of each row behind the row above it."""
-    jitter_us: NonNegativeFloat
-    """Standard deviation of an event's time."""
     max_events_per_s: PositiveFloat | None
     """Events that the bus of a sensor carries per second; null: no limit."""
     max_wait_us: NonNegativeFloat
     """Longest time that a row waits for the bus; a row that would wait longer is lost."""
 
-    @property
-    def perfect(self) -> bool:
-        """Whether every event leaves at once, with its own time."""
-        return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
-
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0)
+PERFECT = ReadoutConfig(max_events_per_s=None, max_wait_us=0.0)
 
 
 @dataclass(frozen=True)
@@ -209,28 +200,19 @@ def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np
     return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])
 
 
-def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> Events:
+def read_out(events: Events, config: ReadoutConfig, duration_us: int) -> Events:
     """The events of one sensor as they leave it, in time order.
 
-    `key` (modulo 2^64) seeds the jitter. Events lost on the bus are missing, and those that would leave after
-    `duration_us`.
+    Events lost on the bus are missing, and those that would leave after `duration_us`.
     """
-    if config.perfect or len(events) == 0:
+    if config.max_events_per_s is None:
         return events
     forget_stale_code(Path(__file__).parent)
-    t, y = events.t.numpy(), events.y.numpy()
-    times_us = t + config.row_latency_us * y
-    if config.jitter_us:
-        jitter = randomness.normal_map(np.uint64(key % 2**64), randomness.TIMESTAMP, 0, len(t))
-        times_us = times_us + config.jitter_us * jitter.astype(np.float64)
-    order = np.lexsort((y, t, np.rint(times_us))) if config.jitter_us or config.row_latency_us else np.arange(len(t))
-    times_us, rows = np.maximum(times_us[order], 0), y[order].astype(np.int64)
-    carried = np.ones(len(order), bool)
-    if config.max_events_per_s:
-        times_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
-    stamps = np.rint(times_us).astype(np.int64)
-    left = carried & (stamps <= duration_us)
-    return replace(select(events, torch.from_numpy(order[left])), t=torch.from_numpy(stamps[left]))
+    rows, times_us = events.y.numpy().astype(np.int64), events.t.numpy().astype(np.float64)
+    leaves_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
+    stamps = np.rint(leaves_us).astype(np.int64)
+    left = torch.from_numpy(carried & (stamps <= duration_us))
+    return replace(select(events, left), t=torch.from_numpy(stamps)[left])
 
 
 @compiled

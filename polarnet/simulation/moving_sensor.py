@@ -62,13 +62,13 @@ def emulate_motion(
 
 def leave_sensors(channels: list[Events], camera: Camera, duration_us: int) -> list[Events]:
     """Apply the readout to the four channels of a whole sequence: to four sensors, or to one DoFP sensor."""
-    readout, key = camera.readout, camera.key
-    if readout.perfect:
+    readout = camera.readout
+    if readout.max_events_per_s is None:
         return channels
     if camera.polarizers.layout == "dofp":
         mosaic = parse_mosaic(camera.polarizers.mosaic)
-        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us), mosaic)
-    return [read_out(channel, readout, key + number, duration_us) for number, channel in enumerate(channels)]
+        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, duration_us), mosaic)
+    return [read_out(channel, readout, duration_us) for channel in channels]
 
 
 def emulate_motion_steps(

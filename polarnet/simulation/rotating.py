@@ -69,7 +69,7 @@ def emulate_rotating(
     rendered = rendered_chunks(scene, pose, t_us, size)
     frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
     (events,), _ = emulate_frames(Channels(*size, sensor, camera.key), frames)
-    return read_out(events, camera.readout, camera.key, duration_us)
+    return read_out(events, camera.readout, duration_us)
 
 
 def emulate_rotating_scenes(

@@ -182,11 +182,11 @@ def test_raw_mosaics_give_the_events_of_the_demosaicked_scenes(tmp_path, kind):
 
 def test_sizes_polarizers_readout_and_upsampling_are_those_of_the_python_call():
     write_video("walk.mp4", scenery(3, 32, 40))
-    settings = ["polarizers=micropolarizers", "readout.jitter_us=50", "readout.max_events_per_s=300000"]
+    settings = ["polarizers=micropolarizers", "readout.max_events_per_s=300000"]
     assert main(["simulate", "walk.mp4", "--size", "20", "30", "--out", "out", "--upsample", *settings]) == 0
     frames = [frame.permute(1, 2, 0).numpy() for frame in rgb(decoded("walk.mp4"))]
     small = [torch.from_numpy(fit(frame, 20, 30, 1.0).transpose(2, 0, 1).copy()) for frame in frames]
-    readout = replace(PERFECT, jitter_us=50.0, max_events_per_s=300_000.0, max_wait_us=1000.0)
+    readout = replace(PERFECT, max_events_per_s=300_000.0, max_wait_us=1000.0)
     camera = Camera(SENSORS["default"], POLARIZERS["micropolarizers"], readout)
     expected = simulate_video(small, T_US, camera, seed=1, upsample=True).events
     assert (expected[0].height, expected[0].width) == (10, 15)
