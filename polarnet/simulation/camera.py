@@ -107,8 +107,10 @@ class Camera:
     def sections(self) -> dict[str, Any]:
         """The sections by name."""
         return {
-            "emulate": asdict(self.sensor), "polarizers": asdict(self.polarizers), "readout": asdict(self.readout),
-        }  # fmt: skip
+            "emulate": asdict(self.sensor),
+            "polarizers": asdict(self.polarizers),
+            "readout": asdict(self.readout),
+        }
 
     def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
         """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
