@@ -48,8 +48,10 @@ def draws(config: Any, seed: int, sequence: str) -> dict[str, Any]:
         generator = generator_for(seed, sequence, name)
         if name in NAMES:
             values[name] = listed[int(generator.integers(len(listed)))]
-        elif name.endswith(LOGARITHMIC):
-            values[name] = math.exp(generator.uniform(*map(math.log, listed)))
+            continue
+        lowest, highest = listed
+        if name.endswith(LOGARITHMIC):
+            values[name] = math.exp(generator.uniform(math.log(lowest), math.log(highest)))
         else:
-            values[name] = generator.uniform(*listed)
+            values[name] = generator.uniform(lowest, highest)
     return values
