@@ -179,8 +179,8 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
 
     from polarnet.config.tree import load
     from polarnet.simulation.camera import Camera
-    from polarnet.simulation.dataset import emulate_scenes
-    from polarnet.simulation.motion import Trajectory, frame_times_us, random_trajectory
+    from polarnet.simulation.event_sets import emulate_scenes
+    from polarnet.simulation.motion import frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
     from polarnet.simulation.truth import frames_of
     from polarnet.storage.frames import Contents, FrameStore, Polarization
@@ -201,7 +201,6 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         Contents(splits, {"layout": "four_sensors"}, sequences_per_part=2),
         {name: name[0] for name in splits},
         window,
-        Trajectory.vector_names(),
     )
     frames = FrameStore.create(folder / "frames.zarr", Contents(splits), *window)
     for number, name in enumerate(scenes.sequences):
@@ -210,7 +209,7 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
         s0, dolp, fraction = torch.nn.functional.interpolate(coarse, (60, 80), mode="bilinear")[0]
         trajectory = random_trajectory(motion, 60, 80, generator)
         stored = as_stored(Polarization(s0, dolp, 3.14 * fraction))
-        scenes.write(name, stored, torch.from_numpy(trajectory.to_vector()), t_us[-1])
+        scenes.write(name, stored, dataclasses.asdict(trajectory), t_us[-1])
         scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
         frames.write(name, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *window))
     scenes.finish()

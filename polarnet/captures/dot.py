@@ -163,7 +163,7 @@ def _frames(path: Path) -> Iterator[Picture]:
     """Frames of a video or a folder as grey pictures on the scale of a BIN file, timed by a text or the video."""
     file = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
     stated = times_from_file(file, "us") if file.is_file() else None
-    clip = open_clip([path], ClipOptions(grey=True))
+    clip = open_clip(path, ClipOptions(grey=True))
     if stated is not None and clip.count not in (None, len(stated)):
         raise RecordingError(
             f"{path.name}: expected a time for each of {clip.count} frames, {file.name} has {len(stated)}"

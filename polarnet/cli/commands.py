@@ -197,7 +197,7 @@ def _simulate(command: AddCommand) -> None:
 Makes the events of a camera with four polarizers, the true DoLP and AoLP, and a preview video. INPUT is one of:
 - a photograph, or one measurement of polarization: a sensor moves over it (sections ingest and synthesize)
 - a video, or a folder of frames: hue becomes AoLP, saturation DoLP and value S0; the pixels see those of the frames
-- four videos behind polarizers, NAME_0.mp4 ... NAME_135.mp4, or a folder of frames NAME_0, NAME_45, NAME_90, NAME_135
+- a folder of frames behind polarizers, NAME_0, NAME_45, NAME_90, NAME_135 for each
 - with --mosaic: a video or a folder of raw frames of a polarization camera
 Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor=noisy polarizers=film seed=2.""",
     )

@@ -57,16 +57,17 @@ def simulate(options: argparse.Namespace) -> None:
     """Simulate, write the files and print facts about them."""
     words = [*options.words, *options.to, *options.overrides]
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
-    inputs = [Path(word).resolve() for word in options.words if word not in overrides]
+    inputs = [word for word in options.words if word not in overrides]
     formats = list(dict.fromkeys(word for word in options.to if word not in overrides)) or [STORE]
     _check(options, inputs, overrides, formats)
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
-    clip = open_clip(inputs, ClipOptions(mosaic, options.white, options.grey, size))
+    path = Path(inputs[0]).resolve()
+    clip = open_clip(path, ClipOptions(mosaic, options.white, options.grey, size))
     unused = ["times", "fps", "size", "upsample"] if clip.still else []
-    unused += ["grey" if clip.measured else "white", *(["mosaic"] if len(inputs) == 4 else [])]
+    unused.append("grey" if clip.measured else "white")
     refuse(options, "a single frame" if clip.still else clip.words, unused)
-    times = None if clip.still else timed(options, clip, inputs[0])
+    times = None if clip.still else timed(options, clip, path)
     folder, out = working_folder(), (options.out or working_folder() / "outputs" / "simulate" / clip.name).resolve()
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         config = load(settings_root(), overrides, folder)
@@ -89,13 +90,13 @@ def simulate(options: argparse.Namespace) -> None:
     print(f"folder      {out}")
 
 
-def _check(options: argparse.Namespace, inputs: list[Path], overrides: list[str], formats: list[str]) -> None:
+def _check(options: argparse.Namespace, inputs: list[str], overrides: list[str], formats: list[str]) -> None:
     if unknown := [form for form in formats if form not in FORMATS]:
         raise ValueError(f"--to: expected some of {', '.join(FORMATS)}, got {', '.join(unknown)}")
     if "hdf5" in formats:
         h5py_module()  # where it is missing, say so before the simulation
-    if not inputs:
-        raise ValueError(f"expected an input before {overrides[0]}; name a picture, a video or a folder of frames")
+    if len(inputs) != 1:
+        raise ValueError(f"expected one picture, video or folder of frames before KEY=VALUE, got {len(inputs)}")
     if options.fps is not None and not 0 < options.fps <= 1e6:
         raise ValueError(f"--fps: expected more than 0 and at most 1e6 Hz, got {options.fps:g}")
     if options.size and min(options.size) < 2:

@@ -78,9 +78,9 @@ def write_simulation(
 ) -> tuple[dict[str, str], list[str]]:
     """Run a simulation and write its files, in constant memory except for the store's columns; returns facts and notes.
 
-    Events wait on disk until the simulation ends. A readout other than the perfect one also needs all events of a
-    sensor in memory. `total` is the expected number of true frames; None: unknown. ValueError for a simulation of more
-    than 71 minutes or without duration.
+    Events wait on disk until the simulation ends. A readout with a limit also needs all events of a sensor in memory.
+    `total` is the expected number of true frames; None: unknown. ValueError for a simulation of more than 71 minutes or
+    without duration.
     """
     spool = EventSpool(output.folder / SPOOL)
     truth = GrowingColumns(output.folder / TRUTH, FRAMES_PER_CHUNK, False, TRUTH_CONVENTIONS)

@@ -27,7 +27,7 @@ from polarnet.pictures.ingest import IngestConfig
 from polarnet.runtime.cluster import pmap
 from polarnet.runtime.machine import RuntimeConfig, configure, threads_of
 from polarnet.runtime.sections import one_of, section, section_of
-from polarnet.simulation.camera import Camera, PolarizersConfig, ReadoutConfig, channel_size
+from polarnet.simulation.camera import Camera, PolarizersConfig, ReadoutConfig, grid
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.rotating import RotatingConfig
@@ -163,7 +163,7 @@ class Config:
     def _check_sizes(self) -> None:
         """ValueError for a DoFP sensor of odd size, a crop larger than a channel, and images too small for LPIPS."""
         size = self.synthesize.sensor_height, self.synthesize.sensor_width
-        channel = list(channel_size(self.polarizers.layout, *size))
+        channel = list(grid(self.polarizers.layout, *size)[:2])
         crops = {"train": self.train.crop}
         crops |= {f"baselines.{name}": self.baseline_config(name).crop for name in self.baselines.trained}
         for training, crop in crops.items():

@@ -14,8 +14,8 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 
 from polarnet.pictures import images, polarimetry
 from polarnet.pictures.images import UnreadablePicture, code_fractions, extension
-from polarnet.pictures.polarimetry import ANGLE_SUFFIX, MIN_MOSAIC_SIDE
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
+from polarnet.pictures.polarimetry import MIN_MOSAIC_SIDE
+from polarnet.stokes import Mosaic
 
 VIDEOS = frozenset(["mp4", "m4v", "mov", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "gif"])
 """Lower-case extensions of files that are read as videos."""
@@ -61,33 +61,23 @@ class Clip:
     frames: Callable[[], Iterator[ClipFrame]]
 
 
-def open_clip(paths: Sequence[Path], options: ClipOptions) -> Clip:
-    """Open a video, a folder of frames, four videos behind polarizers, or the picture of a single frame.
+def open_clip(path: Path, options: ClipOptions) -> Clip:
+    """Open a video, a folder of frames, or the picture or measurement of a single frame.
 
     A folder whose files are all NAME_0, NAME_45, NAME_90, NAME_135 or .npz holds measured polarization, unless its
     numbers count frames; with a `mosaic`, a video or a folder holds raw mosaics. The frames of a folder follow the
     numbers in their names. FileNotFoundError or UnreadablePicture for files that are missing, damaged or do not belong
     together, on iterating for later frames.
     """
-    missing = [str(path) for path in paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file or folder")
-    name = paths[0].stem if paths[0].is_file() else paths[0].resolve().name
-    if len(paths) == 4 and all(extension(path) not in VIDEOS for path in paths):
-        return _open_files([tuple(paths)], ANGLE_SUFFIX.sub(r"\g<name>", name), options)
-    if len(paths) == 4:
-        videos = _videos_by_angle(paths)
-        return _measured(videos[0].stem.rpartition("_")[0] or name, "four polarizers", _from_videos(videos), options)
-    if len(paths) != 1:
-        raise UnreadablePicture(f"expected one file or folder, or four videos behind polarizers, got {len(paths)}")
-    (path,) = paths
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file or folder")
     if path.is_dir():
-        return _open_folder(path, name, options)
-    if extension(path) in VIDEOS:
-        if options.mosaic is not None:
-            return _measured(name, "raw mosaics", _from_videos([path]), options)
-        return _coloured(name, "video", _from_videos([path], colour=True), options)
-    return _open_files([(path,)], name, options)
+        return _open_folder(path, path.resolve().name, options)
+    if extension(path) not in VIDEOS:
+        return _open_files([(path,)], path.stem, options)
+    if options.mosaic is not None:
+        return _measured(path.stem, "raw mosaics", _from_video(path), options)
+    return _coloured(path.stem, "video", _from_video(path, colour=True), options)
 
 
 @dataclass(frozen=True)
@@ -134,53 +124,38 @@ def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, 
 
 def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3 h w"]:
     """sRGB code values, or light as shares of `white` (`images.light_of`); a picture with one channel is grey."""
-    (path,) = paths
-    light, channels = images.holds_light(path), images.read_channels(path)
-    if channels.shape[2] == 1:
-        grey = np.repeat(channels, 3, axis=2)
-        return (images.light_of(grey, white) if light else code_fractions(grey)).transpose(2, 0, 1)
-    picture = images.read_picture(path)
-    if light:
+    picture = images.read_picture(paths[0], grey=True)
+    if picture.light:
         return images.light_of(picture.pixels, white).transpose(2, 0, 1)
     return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 
-def _from_videos(paths: Sequence[Path], colour: bool = False) -> _Files:
-    """Frames of one video, or of four that advance together: RGB in [0, 1] if `colour`, else green 8-bit levels."""
-    captures = [_capture(path) for path in paths]
-    stated = [max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))) for capture in captures]
-    for capture in captures:
-        capture.release()
+def _from_video(path: Path, colour: bool = False) -> _Files:
+    """Frames of a video: RGB in [0, 1] if `colour`, else green 8-bit levels."""
+    capture = _capture(path)
+    stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    capture.release()
 
     def levels() -> Iterator[tuple[str, Levels, float | None]]:
-        opened = [_capture(path) for path in paths]
+        opened = _capture(path)
         try:
             for number in itertools.count():
-                read = [capture.read() for capture in opened]
-                ended = [path.name for path, (there, _) in zip(paths, read, strict=True) if not there]
-                if len(ended) == len(paths):
+                there, pixels = opened.read()
+                if not there:
                     break
-                if ended:
-                    names = ", ".join(ended)
-                    raise UnreadablePicture(f"{names} ends after {number} frames, before the others; cut all alike")
-                planes = [_checked(path, pixels) for path, (_, pixels) in zip(paths, read, strict=True)]
-                t_us = 1000 * opened[0].get(cv2.CAP_PROP_POS_MSEC)
-                if colour:
-                    yield f"frame {number}", code_fractions(planes[0][..., ::-1].transpose(2, 0, 1)), t_us
-                    continue
-                if len({plane.shape for plane in planes}) > 1:
-                    sizes = ", ".join(
-                        f"{path.name} {plane.shape[:2]}" for path, plane in zip(paths, planes, strict=True)
+                if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
+                    raise UnreadablePicture(
+                        f"{path.name}: expected frames of 3 x 8 bits, got {pixels.dtype} {pixels.shape}"
                     )
-                    raise UnreadablePicture(f"expected four videos of one size, got {sizes}")
-                yield f"frame {number}", np.stack([plane[..., GREEN] for plane in planes]), t_us
+                t_us = 1000 * opened.get(cv2.CAP_PROP_POS_MSEC)
+                planes = code_fractions(pixels[..., ::-1].transpose(2, 0, 1)) if colour else pixels[None, ..., GREEN]
+                yield f"frame {number}", planes, t_us
         finally:
-            for capture in opened:
-                capture.release()
+            opened.release()
         if number == 0:
-            raise UnreadablePicture(f"{paths[0].name}: no frame of it can be read; convert it to MP4 or PNG files")
+            raise UnreadablePicture(f"{path.name}: no frame of it can be read; convert it to MP4 or PNG files")
 
-    return _Files(min(stated) or None, False, levels)
+    return _Files(stated if stated > 0 else None, False, levels)
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
@@ -188,23 +163,6 @@ def _capture(path: Path) -> cv2.VideoCapture:
     if not capture.isOpened():
         raise UnreadablePicture(f"{path.name}: OpenCV cannot open it as a video; convert it to MP4 or a folder of PNG")
     return capture
-
-
-def _checked(path: Path, pixels: np.ndarray) -> Shaped[np.ndarray, "h w 3"]:
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
-        raise UnreadablePicture(f"{path.name}: expected frames of 3 x 8 bits, got {pixels.dtype} {pixels.shape}")
-    return pixels
-
-
-def _videos_by_angle(paths: Sequence[Path]) -> list[Path]:
-    """Four videos in the order of the angles in their names, 0, 45, 90, 135."""
-    angles = [int(match["angle"]) for path in paths if (match := ANGLE_SUFFIX.fullmatch(path.stem))]
-    if sorted(angles) != list(POLARIZER_ANGLES_DEG):
-        raise UnreadablePicture(
-            f"four videos: expected one behind each of 0, 45, 90, 135 degrees, got {angles}; name them NAME_0, "
-            f"NAME_45, NAME_90, NAME_135"
-        )
-    return [path for _, path in sorted(zip(angles, paths, strict=True))]
 
 
 def _coloured(name: str, kind: str, files: _Files, options: ClipOptions, light: bool = False) -> Clip:

@@ -45,7 +45,7 @@ class Picture:
     pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; float: 1.0 is white
     profile: bytes | None  # embedded ICC profile
     colour_space: str  # OpenImageIO's name of the encoding; means nothing beside a profile
-    profile_name: str | None
+    light: bool  # whether the pixels are linear light in floating-point numbers, as in OpenEXR and Radiance HDR files
     author: str | None
     licence: str | None
 
@@ -73,31 +73,35 @@ def picture_extensions() -> frozenset[str]:
     return frozenset(known - NO_PICTURES) | CAMERA_RAW | NOT_IN_THE_WHEEL
 
 
-def read_picture(path: str | os.PathLike[str]) -> Picture:
+def read_picture(path: str | os.PathLike[str], grey: bool = False) -> Picture:
     """Read the first picture of a file, without alpha and turned upright by its EXIF orientation.
 
-    UnreadablePicture with the reason: no picture, damaged, cut off, camera raw, more than MAX_PIXELS, fewer than three
-    channels, or values that are not finite.
+    With `grey`, one channel is read as three equal ones in sRGB. UnreadablePicture with the reason: no picture,
+    damaged, cut off, camera raw, more than MAX_PIXELS, fewer than three channels, or values that are not finite.
     """
     pixels, spec, file_format = _read(Path(path))
-    if not _is_light(spec, file_format):
+    light = _is_light(spec, file_format)
+    if not light:
         _check_white(pixels)
+    colours = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
+    if grey and len(colours) == 1:
+        return Picture(np.repeat(pixels[..., colours], 3, axis=2), None, SRGB, light, None, None)
     profile = spec.get("ICCProfile")
     if profile is None and file_format == "png" and _names_profile(Path(path)):
         raise UnreadablePicture("the embedded colour profile is damaged; save the file again, with or without one")
     return Picture(
-        pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, spec.alpha_channel)]),
+        pixels=np.ascontiguousarray(pixels[..., _rgb_channels(spec.channelnames, colours)]),
         profile=None if profile is None else np.asarray(profile, dtype=np.uint8).tobytes(),
         colour_space=_colour_space(spec, file_format),
-        profile_name=spec.get_string_attribute("ICCProfile:profile_description") or None,
+        light=light,
         author=spec.get_string_attribute("Artist") or None,
         licence=spec.get_string_attribute("Copyright") or None,
     )
 
 
-def read_channels(path: str | os.PathLike[str], as_stored: bool = False) -> Shaped[np.ndarray, "h w c"]:
-    """The upright code values of all channels except alpha, or `as_stored`; raises as `read_picture` does."""
-    pixels, spec, file_format = _read(Path(path), as_stored)
+def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
+    """Code values of all channels except alpha, not turned by an orientation; raises as `read_picture` does."""
+    pixels, spec, file_format = _read(Path(path), as_stored=True)
     if not _is_light(spec, file_format):
         _check_white(pixels)
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
@@ -149,15 +153,15 @@ def _from_profile(rgb: Float32[np.ndarray, "h w 3"], profile: bytes) -> Float32[
     return converted(np.round(255 * rgb).astype(np.uint8)).astype(np.float32) / 255
 
 
-def code_fractions(pixels: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "h w c"]:
+def code_fractions(pixels: Shaped[np.ndarray, "h w *c"]) -> Float32[np.ndarray, "h w *c"]:
     """Code values as fractions of white: integers become [0, 1]."""
     white = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
     return pixels.astype(np.float32) / np.float32(white)
 
 
 def fit(
-    pixels: Shaped[np.ndarray, "h w c"], height: int, width: int, max_upscale: float
-) -> Float32[np.ndarray, "height width c"]:
+    pixels: Shaped[np.ndarray, "h w *c"], height: int, width: int, max_upscale: float
+) -> Float32[np.ndarray, "height width *c"]:
     """Cut out the largest centred part of shape height:width and scale it to that size; integers become [0, 1].
 
     Shrinks by averaging areas, enlarges by cubic interpolation, without decoding the pixels to linear light.
@@ -219,7 +223,7 @@ def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
     tensor([1.0000e+00, 1.0000e-01, 1.0000e-06])
     """
     picture = read_picture(path)
-    if not holds_light(path):
+    if not picture.light:
         raise UnreadablePicture(
             f"expected linear light in floating-point numbers, as in .exr and .hdr files, got {picture.pixels.dtype} "
             f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
@@ -306,12 +310,11 @@ def _names_profile(png: Path) -> bool:
         return b"iCCP" in file.read(2**20).partition(b"IDAT")[0]
 
 
-def _rgb_channels(names: Sequence[str], alpha: int) -> list[int]:
-    """Indices of R, G and B; without these names, the first three channels except alpha."""
+def _rgb_channels(names: Sequence[str], colours: list[int]) -> list[int]:
+    """Indices of R, G and B; without these names, the first three of `colours`, the channels except alpha."""
     capitals = [name.upper() for name in names]
     if all(name in capitals for name in "RGB"):
         return [capitals.index(name) for name in "RGB"]
-    colours = [i for i in range(len(names)) if i != alpha]
     if len(colours) < 3:
         words = "one channel" if len(colours) == 1 else f"{len(colours)} channels"
         raise UnreadablePicture(f"{words}, no RGB: saturation and hue, and so polarization, would be 0 everywhere")

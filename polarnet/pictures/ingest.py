@@ -25,11 +25,9 @@ from polarnet.pictures.polarimetry import group_by_measurement, parse_raw_mosaic
 from polarnet.runtime.files import claimed, publish, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.runtime.splits import SPLITS
 
 logger = logging.getLogger(__name__)
 
-LIGHT_BITS = 32  # of a channel of a picture of light
 EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
@@ -116,7 +114,7 @@ def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mappe
 
 def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mapper) -> Manifest:
     """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
-    sources, ignored, dead = _find_pictures(Path(config.root), config.source)
+    sources, ignored = _find_pictures(Path(config.root), config.source)
     if config.limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
     limit = config.limit or len(sources)
@@ -132,30 +130,24 @@ def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mappe
         raise ValueError(
             f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
             f"{', '.join(sorted(_extensions(config.source)))}: found {len(sources)} pictures and {ignored} other files."
-            f"{listed([*skipped, *dead])}"
+            f"{listed(skipped)}"
         )
-    manifest = _manifest(_split(config, entries), [*skipped, *dead], folder)
+    manifest = _manifest(_split(config, entries), skipped, folder)
     return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
 
 
-def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int, list[Skipped]]:
-    """Files under `root` with a picture's extension, by path, the number of other files, and the dead links."""
+def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
+    """Files under `root` with a picture's extension, by path, and the number of other files."""
     if not root.is_dir():
         raise ValueError(f"ingest.root: expected a folder with pictures, got {root}; see ingest.source")
-    paths = files_under(root)
-    files = [path for path in paths if path.is_file()]
-    dead = [
-        Skipped(_relative(path, root), "a dead link: its target does not exist; restore it or remove the link")
-        for path in paths
-        if path.is_symlink() and not path.exists()
-    ]
+    files = [path for path in files_under(root) if path.is_file() or path.is_symlink()]  # a dead link is skipped later
     pictures = [path for path in files if extension(path) in _extensions(kind)]
     groups = group_by_measurement(pictures) if kind == "polarization" else [(path,) for path in pictures]
     sources = []
     for group in groups:
         stem = group[0].stem if len(group) == 1 else group[0].stem.rpartition("_")[0]
         sources.append(Source(group, kind, stem, ", ".join(_relative(path, root) for path in group)))
-    return sources, len(files) - len(pictures), dead
+    return sources, len(files) - len(pictures)
 
 
 def files_under(root: Path) -> list[Path]:
@@ -201,22 +193,21 @@ def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> Ma
     """
     number, source = item
     try:
-        picture, light = images.read_picture(source.files[0]), images.holds_light(source.files[0])
-        pixels = images.light_of(picture.pixels) if light else picture.pixels
+        picture = images.read_picture(source.files[0])
+        pixels = images.light_of(picture.pixels) if picture.light else picture.pixels
         fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
-        rgb = fitted if light else images.srgb_of(fitted, picture)
+        rgb = fitted if picture.light else images.srgb_of(fitted, picture)
     except UnreadablePicture as error:
         return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
-    file, bits = f"source-{number:08d}{images.LIGHT if light else '.png'}", LIGHT_BITS if light else picture.bits
-    if light:
+    file = f"source-{number:08d}{images.LIGHT if picture.light else '.png'}"
+    if picture.light:
         np.save(folder / file, rgb)
     else:
-        write_png(folder / file, rgb, bits)
+        write_png(folder / file, rgb, picture.bits)
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{picture.sha256[:8]}", file=file, source=source.kind, origin=source.origin,
         licence=source.licence or picture.licence, author=source.author or picture.author, sha256=picture.sha256,
-        bits=bits, height=config.height, width=config.width, source_height=picture.pixels.shape[0],
-        source_width=picture.pixels.shape[1], colour_profile=picture.profile_name,
+        height=config.height, width=config.width,
     )  # fmt: skip
 
 
@@ -236,12 +227,11 @@ def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder
     file = f"source-{number:08d}.npz"
     polarimetry.write_intensities(folder / file, shrunk)
     digest = sha256(measured.intensities.tobytes(), measured.valid.tobytes())
-    (height, width), (source_height, source_width) = shrunk.valid.shape, measured.valid.shape
+    height, width = shrunk.valid.shape
     return ManifestEntry(
         name=f"{_slug(source.stem)}-{digest[:8]}", file=file, source=source.kind, origin=source.origin, sha256=digest,
-        bits=16, height=height, width=width, source_height=source_height, source_width=source_width,
-        residual=round(measured.residual, 6), saturated_fraction=round(measured.saturated, 6),
-        masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
+        height=height, width=width, residual=round(measured.residual, 6),
+        saturated_fraction=round(measured.saturated, 6), masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
     )  # fmt: skip
 
 
@@ -255,8 +245,7 @@ def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path
     digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
     return ManifestEntry(
         name=f"{stem}-{digest[:8]}", file=f"{stem}.png", source="dead_leaves", origin=f"generated from seed {seed}",
-        licence="CC0-1.0", author="polarnet", sha256=digest, bits=8, height=config.height, width=config.width,
-        source_height=config.height, source_width=config.width,
+        licence="CC0-1.0", author="polarnet", sha256=digest, height=config.height, width=config.width,
     )  # fmt: skip
 
 
@@ -300,12 +289,6 @@ def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
     for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
         if fraction > 0 and not manifest.counts[split]:
             logger.warning("split %s is empty, because %d pictures are too few", split, len(manifest.pictures))
-    if config.source != "builtin" and config.limit is not None and len(manifest.pictures) < config.limit:
-        counts = ", ".join(f"{manifest.counts[split]} {split}" for split in SPLITS)
-        logger.warning(
-            "ingest.limit=%d: the folder has only %d usable pictures, split into %s; for other numbers change "
-            "ingest.val_fraction and ingest.test_fraction", config.limit, len(manifest.pictures), counts,
-        )  # fmt: skip
 
 
 def _slug(stem: str) -> str:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from polarnet.runtime.files import check_seal, seal
 from polarnet.runtime.splits import SPLITS
 
@@ -26,12 +28,8 @@ class ManifestEntry:
     licence: str | None = None
     author: str | None = None
     sha256: str  # hash of the source's upright pixels, before cropping, scaling and conversion
-    bits: int
     height: int
     width: int
-    source_height: int
-    source_width: int
-    colour_profile: str | None = None  # colour space of the source, if it was converted to sRGB
     residual: float | None = None  # median of |I0 + I90 - I45 - I135| / S0 (measured polarization)
     saturated_fraction: float | None = None  # share of source pixels with a saturated angle (measured polarization)
     masked_fraction: float | None = None
@@ -91,12 +89,8 @@ def split_by_content(hashes: Sequence[str], val_fraction: float, test_fraction: 
 
 def write_manifest(manifest: Manifest, folder: Path) -> None:
     """Write `folder`/manifest.json, the same bytes for the same manifest, and seal the folder."""
-    content = {
-        "pictures": [asdict(entry) for entry in manifest.pictures],
-        "skipped": [asdict(skipped) for skipped in manifest.skipped],
-        "counts": manifest.counts,
-    }
-    (folder / MANIFEST).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(asdict(manifest), indent=1, ensure_ascii=False)
+    (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
     seal(folder)
 
 
@@ -107,12 +101,6 @@ def read_manifest(folder: Path) -> Manifest:
         raise FileNotFoundError(f"{path}: no manifest; run the stage ingest first (dvc repro ingest)")
     check_seal(folder)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return Manifest(
-            pictures=tuple(ManifestEntry(**entry) for entry in content["pictures"]),
-            skipped=tuple(Skipped(**skipped) for skipped in content["skipped"]),
-            ignored_files=content["counts"]["ignored_files"],
-            unread_files=content["counts"]["unread_files"],
-        )
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path}: not a manifest of this version ({error}); run the stage ingest again") from error
+        return TypeAdapter(Manifest).validate_json(path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{path}: not a manifest of this version; run the stage ingest again") from error

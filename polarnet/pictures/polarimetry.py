@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Shaped
 from torch import Tensor
 
-from polarnet.pictures.images import UnreadablePicture, extension, read_channels
+from polarnet.pictures.images import UnreadablePicture, extension, fit, read_channels
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, parse_mosaic
 
 ANGLE_SUFFIX = re.compile(r"(?P<name>.+)_0{0,2}(?P<angle>0|45|90|135)")
@@ -162,18 +161,12 @@ def shrink(measurement: Measurement, height: int, width: int) -> Measurement:
 
     A pixel is valid if all pixels that it averages are valid.
     """
-    rows, columns = measurement.valid.shape
-    part_height, part_width = min(rows, round(columns * height / width)), min(columns, round(rows * width / height))
-    if part_height < height or part_width < width:
+    planes = *measurement.intensities, ~measurement.valid
+    try:
+        *intensities, invalid = (fit(plane, height, width, max_upscale=1.0) for plane in planes)
+    except UnreadablePicture:
         return measurement
-    top, left = (rows - part_height) // 2, (columns - part_width) // 2
-    part = np.s_[top : top + part_height, left : left + part_width]
-
-    def scaled(plane: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h2 w2"]:
-        return cv2.resize(plane[part].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-
-    intensities = np.stack([scaled(plane) for plane in measurement.intensities])
-    return replace(measurement, intensities=intensities, valid=scaled(~measurement.valid) == 0)
+    return replace(measurement, intensities=np.stack(intensities), valid=invalid == 0)
 
 
 def write_intensities(path: str | os.PathLike[str], measurement: Measurement) -> None:
@@ -239,7 +232,7 @@ def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
     missing = [angle for angle in POLARIZER_ANGLES_DEG if angle not in by_angle]
     if missing:
         raise UnreadablePicture(f"no file for {', '.join(f'_{angle}' for angle in missing)} beside {files[0].name}")
-    pictures = [read_channels(by_angle[angle], as_stored=True) for angle in POLARIZER_ANGLES_DEG]
+    pictures = [read_channels(by_angle[angle]) for angle in POLARIZER_ANGLES_DEG]
     planes = [picture[..., 1 if picture.shape[2] >= 3 else 0] for picture in pictures]
     return _stacked(planes, [by_angle[angle].name for angle in POLARIZER_ANGLES_DEG])
 
@@ -247,7 +240,7 @@ def _read_angles(files: Sequence[Path]) -> Shaped[np.ndarray, "4 h w"]:
 def read_raw(paths: Sequence[Path]) -> Shaped[np.ndarray, "1 h w"]:
     """Code values of the one file of a raw mosaic; raises as `read_measurement`."""
     (path,) = paths
-    pixels = read_channels(path, as_stored=True)
+    pixels = read_channels(path)
     if pixels.shape[2] != 1:
         raise UnreadablePicture(
             f"{pixels.shape[2]} channels: neither a raw mosaic nor one of NAME_0, NAME_45, NAME_90, NAME_135"

@@ -23,7 +23,7 @@ from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.ranges import RandomisedConfig, draws
+from polarnet.simulation.ranges import draws
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 Value = TypeVar("Value")
@@ -32,7 +32,7 @@ MAX_CROSSTALK = 0.8  # share of a pixel's light from its four neighbours; at 0.8
 
 
 @section
-class PolarizersConfig(RandomisedConfig):
+class PolarizersConfig:
     """Section `polarizers` of params.yaml. Lists hold one value for each of 0, 45, 90 and 135 degrees."""
 
     layout: Annotated[str, one_of(("four_sensors", "dofp"))]
@@ -58,7 +58,6 @@ class PolarizersConfig(RandomisedConfig):
     """Share of a DoFP pixel's light that falls in through its four neighbours' polarizers."""
 
     def __post_init__(self):
-        super().__post_init__()
         parse_mosaic(self.mosaic)
         if self.crosstalk and self.layout != "dofp":
             raise ValueError(f"crosstalk: expected 0 with layout {self.layout}, got {self.crosstalk}")
@@ -69,39 +68,25 @@ class PolarizersConfig(RandomisedConfig):
         spread = self.extinction_spread or self.angle_spread_deg or self.transmission_spread
         return self.layout == "four_sensors" and not spread
 
-    @property
-    def max_crosstalk(self) -> float:
-        """Largest crosstalk that a sequence may draw."""
-        return max(self.crosstalk, *map(float, (self.randomise or {}).get("crosstalk", [0.0])))
-
 
 IDEAL = PolarizersConfig(
     layout="four_sensors", mosaic="90 45 / 135 0", extinction_ratio=[None] * NUM_CHANNELS,
     angle_error_deg=[0.0] * NUM_CHANNELS, transmission=[1.0] * NUM_CHANNELS, extinction_spread=0.0,
-    angle_spread_deg=0.0, transmission_spread=0.0, crosstalk=0.0, randomise=None,
+    angle_spread_deg=0.0, transmission_spread=0.0, crosstalk=0.0,
 )  # fmt: skip
 
 
 @section
-class ReadoutConfig(RandomisedConfig):
+class ReadoutConfig:
     """Section `readout` of params.yaml: how events leave the sensor."""
 
-    row_latency_us: NonNegativeFloat
-    """Delay of each row behind the row above it."""
-    jitter_us: NonNegativeFloat
-    """Standard deviation of an event's time."""
     max_events_per_s: PositiveFloat | None
     """Events that the bus of a sensor carries per second; null: no limit."""
     max_wait_us: NonNegativeFloat
     """Longest time that a row waits for the bus; a row that would wait longer is lost."""
 
-    @property
-    def perfect(self) -> bool:
-        """Whether every event leaves at once, with its own time."""
-        return not (self.row_latency_us or self.jitter_us or self.max_events_per_s)
 
-
-PERFECT = ReadoutConfig(row_latency_us=0.0, jitter_us=0.0, max_events_per_s=None, max_wait_us=0.0, randomise=None)
+PERFECT = ReadoutConfig(max_events_per_s=None, max_wait_us=0.0)
 
 
 @dataclass(frozen=True)
@@ -121,23 +106,21 @@ class Camera:
     @property
     def sections(self) -> dict[str, Any]:
         """The sections by name."""
-        return {name: asdict(section) for name, section in self._sections.items()}
+        return {
+            "emulate": asdict(self.sensor),
+            "polarizers": asdict(self.polarizers),
+            "readout": asdict(self.readout),
+        }
 
     def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
         """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
-        values = {name: draws(section, seed, sequence) for name, section in self._sections.items()}
-        return {name: drawn for name, drawn in values.items() if drawn}
+        drawn = draws(self.sensor, seed, sequence)
+        return {"emulate": drawn} if drawn else {}
 
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""
-        sensor, polarizers, readout = (
-            replace(section, **draws(section, seed, sequence), randomise=None) for section in self._sections.values()
-        )
-        return Camera(sensor, polarizers, readout, seed_for(seed, sequence, purpose))
-
-    @property
-    def _sections(self) -> dict[str, Any]:
-        return {"emulate": self.sensor, "polarizers": self.polarizers, "readout": self.readout}
+        sensor = replace(self.sensor, **draws(self.sensor, seed, sequence), randomise=None)
+        return replace(self, sensor=sensor, key=seed_for(seed, sequence, purpose))
 
 
 class Grid(NamedTuple):
@@ -155,11 +138,6 @@ def grid(layout: str, height: int, width: int) -> Grid:
     if height % 2 or width % 2:
         raise ValueError(f"layout dofp: expected a sensor with even sides, for whole 2x2 cells, got {height}x{width}")
     return Grid(height // 2, width // 2, 2)
-
-
-def channel_size(layout: str, height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a channel of a sensor; ValueError as `grid`."""
-    return grid(layout, height, width)[:2]
 
 
 def weights_of(
@@ -224,28 +202,19 @@ def split_cells(frames: Float32[np.ndarray, "n h w"], mosaic: str) -> Float32[np
     return np.stack([frames[:, row::2, column::2] for row, column in places_of(parse_mosaic(mosaic))])
 
 
-def read_out(events: Events, config: ReadoutConfig, key: int, duration_us: int) -> tuple[Events, int]:
-    """The events of one sensor as they leave it, in time order, and the number of events lost on the bus.
+def read_out(events: Events, config: ReadoutConfig, duration_us: int) -> Events:
+    """The events of one sensor as they leave it, in time order.
 
-    `key` (modulo 2^64) seeds the jitter. Events that would leave after `duration_us` are missing.
+    Events lost on the bus are missing, and those that would leave after `duration_us`.
     """
-    if config.perfect or len(events) == 0:
-        return events, 0
+    if config.max_events_per_s is None:
+        return events
     forget_stale_code(Path(__file__).parent)
-    t, y = events.t.numpy(), events.y.numpy()
-    times_us = t + config.row_latency_us * y
-    if config.jitter_us:
-        jitter = randomness.normal_map(np.uint64(key % 2**64), randomness.TIMESTAMP, 0, len(t))
-        times_us = times_us + config.jitter_us * jitter.astype(np.float64)
-    order = np.lexsort((y, t, np.rint(times_us))) if config.jitter_us or config.row_latency_us else np.arange(len(t))
-    times_us, rows = np.maximum(times_us[order], 0), y[order].astype(np.int64)
-    carried = np.ones(len(order), bool)
-    if config.max_events_per_s:
-        times_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
-    stamps = np.rint(times_us).astype(np.int64)
-    left = carried & (stamps <= duration_us)
-    leaving = replace(select(events, torch.from_numpy(order[left])), t=torch.from_numpy(stamps[left]))
-    return leaving, int((~carried).sum())
+    rows, times_us = events.y.numpy().astype(np.int64), events.t.numpy().astype(np.float64)
+    leaves_us, carried = _bus(times_us, rows, 1e6 / config.max_events_per_s, config.max_wait_us)
+    stamps = np.rint(leaves_us).astype(np.int64)
+    left = torch.from_numpy(carried & (stamps <= duration_us))
+    return replace(select(events, left), t=torch.from_numpy(stamps)[left])
 
 
 @compiled

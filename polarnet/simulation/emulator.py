@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, Shaped
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from polarnet.events.stream import Events, concatenate
@@ -18,9 +18,10 @@ from polarnet.runtime.compilation import forget_stale_code
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
-from polarnet.simulation.pixels.defects import Defects, DefectsConfig, defects_of
+from polarnet.simulation.pixels.defects import Defects, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.ranges import RandomisedConfig
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ
+from polarnet.simulation.ranges import check_ranges
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
@@ -65,7 +66,7 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, RandomisedConfig):
+class EmulatorConfig(esim.EsimConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
@@ -80,10 +81,19 @@ class EmulatorConfig(esim.EsimConfig, voltmeter.VoltmeterConfig, DefectsConfig, 
     model: Annotated[str, one_of(MODELS)]
     render_rate_hz: PositiveFloat | None
     """Rate at which the light is rendered; null: one frame for each pixel of motion."""
+    hot_pixel_share: Annotated[float, Field(ge=0, le=1)]
+    """Probability that a pixel is hot: it fires at random times, whatever its light, in every model."""
+    hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
+    """Events per second of a hot pixel, ON and OFF together; 0: it is dead."""
+    randomise: dict[str, list[float | str]] | None
+    """Draws of each sequence: [lowest, highest] of a number, or the names that a parameter of `ranges.NAMES` may take.
+
+    A name that is listed twice is drawn twice as often. null: nothing is drawn.
+    """
 
     def __post_init__(self):
-        esim.EsimConfig.__post_init__(self)
-        RandomisedConfig.__post_init__(self)
+        super().__post_init__()
+        check_ranges(self)
         for name, off in OFF.items():
             value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
             if value != off and self.model not in having:
@@ -106,7 +116,6 @@ class SensorState:
     model: str
     height: int
     width: int
-    channels: tuple[int, ...]
     pixels: tuple[Any, ...]  # state arrays of each channel, as the model's module defines them
     t_us: float  # time of the last frame
     steps: int  # number of frames after the first; random draws are numbered by it
@@ -115,11 +124,10 @@ class SensorState:
 class Channels(NamedTuple):
     """Channels of one kind of sensor."""
 
-    numbers: tuple[int, ...]
     height: int
     width: int
     sensor: EmulatorConfig
-    key: int  # modulo 2^64, seeds all noise; each channel draws its mismatch and noise by its number
+    key: int  # modulo 2^64, seeds all noise; each channel draws its mismatch and noise by its place
 
 
 def emulate(
@@ -128,17 +136,16 @@ def emulate(
     config: EmulatorConfig,
     key: int,
     state: SensorState | None = None,
-    channels: Sequence[int] | None = None,
     threads: int = 1,
 ) -> tuple[list[Events], SensorState]:
     """Events of each channel of a sensor that sees `frames` at times `t_us`, and the sensor's state after them.
 
     Frames are uint8, or float in digital numbers 0..255. Without a state, the pixels adapt to the first frame, which
     fires no event; a clip cut into pieces, each given the state of the previous one, gives the events of the whole
-    clip. `key`, modulo 2^64, seeds all noise, which each channel draws by its number in `channels` (default: 0, 1,
-    ...). Events are in the order (t, y, x, p), and identical for any number of threads and any order of channels.
-    TypeError for anything but an array; ValueError for times that do not increase, are beyond 2^53 us or more than 71
-    minutes apart, values that are not finite or outside 0..255, and sizes that do not fit.
+    clip. `key`, modulo 2^64, seeds all noise, which each channel draws by its place. Events are in the order
+    (t, y, x, p), and identical for any number of threads. TypeError for anything but an array; ValueError for times
+    that do not increase, are beyond 2^53 us or more than 71 minutes apart, values that are not finite or outside
+    0..255, and sizes that do not fit.
 
     >>> import torch
     >>> from polarnet.simulation import SENSORS, emulate
@@ -149,13 +156,12 @@ def emulate(
     """
     frames = as_tensor("frames", frames).detach().cpu()
     check_shape("frames", frames, "... channels height width")
-    numbers = tuple(range(frames.shape[-3])) if channels is None else tuple(channels)
     times = np.asarray(t_us, dtype=np.float64)
-    _check_frames(frames, times, numbers, state, config.model)
+    _check_frames(frames, times, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
-    lights = [light_of_frames(np.ascontiguousarray(clip[:, i])) for i in range(len(numbers))]
+    lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in clip.swapaxes(0, 1)]
     height, width = clip.shape[2:]
-    return emulate_lights(Channels(numbers, height, width, config, key), lights, times, state, threads)
+    return emulate_lights(Channels(height, width, config, key), lights, times, state, threads)
 
 
 def emulate_frames(
@@ -188,20 +194,20 @@ def emulate_lights(
 ) -> tuple[list[Events], SensorState]:
     """Events of channels under `lights` at times `t_us`, and the state after them; `threads` channels run at once."""
     forget_stale_code(Path(__file__).parent)
-    numbers, height, width, config, key = channels
+    height, width, config, key = channels
     model = MODELS[config.model]
     physics, seed = model.physics_of(config), np.uint64(key % 2**64)
     times = _checked_times(t_us if state is None else np.concatenate([[state.t_us], t_us]))
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
     # allocated here, because glibc returns what other threads allocate to the system as soon as they end
-    empty = [empty_columns(room) for _ in numbers]
+    empty = [empty_columns(room) for _ in lights]
 
     def emulate_channel(i: int) -> tuple[list[Tensor], Any]:
-        defects = defects_of(config, height * width, seed, numbers[i], round_up=model is v2e)
-        steps = Steps(physics, height, width, times, first_frame, first_number, seed, numbers[i], defects)
+        defects = defects_of(config.hot_pixel_share, config.hot_pixel_rate_hz, height * width, seed, i, model is v2e)
+        steps = Steps(physics, height, width, times, first_frame, first_number, seed, i, defects)
         if state is None:
-            pixels = model.initial(height, width, physics, seed, numbers[i])
+            pixels = model.initial(height, width, physics, seed, i)
             model.start(lights[i], pixels, steps)
         else:
             pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
@@ -210,10 +216,10 @@ def emulate_lights(
 
     with ThreadPoolExecutor(threads) as pool:
         channel_map = pool.map if threads > 1 else map
-        columns, pixels = zip(*channel_map(emulate_channel, range(len(numbers))), strict=True)
+        columns, pixels = zip(*channel_map(emulate_channel, range(len(lights))), strict=True)
     events = [Events(t, x, y, p, height, width) for t, x, y, p in columns]
     steps_taken = first_number + len(times) - 1
-    return events, SensorState(config.model, height, width, numbers, pixels, float(times[-1]), steps_taken)
+    return events, SensorState(config.model, height, width, pixels, float(times[-1]), steps_taken)
 
 
 def _checked_times(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -237,9 +243,7 @@ def _checked_times(times: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"
     return times
 
 
-def _check_frames(
-    frames: Tensor, times: Float64[np.ndarray, " m"], channels: tuple[int, ...], state: SensorState | None, model: str
-) -> None:
+def _check_frames(frames: Tensor, times: Float64[np.ndarray, " m"], state: SensorState | None, model: str) -> None:
     if frames.ndim != 4 or len(frames) != len(times) or len(times) == 0:
         raise ValueError(
             f"emulate: expected frames (n, channels, h, w) with one time each and at least one frame, "
@@ -250,10 +254,8 @@ def _check_frames(
             raise ValueError(f"emulate: expected frames as uint8 or float digital numbers (0..255), got {frames.dtype}")
         check_finite("frames", frames)
         check_range("frames", frames, 0, FULL_SCALE, "digital numbers", f"scale white to {FULL_SCALE:g}")
-    if len(set(channels)) != frames.shape[1]:
-        raise ValueError(f"emulate: expected {frames.shape[1]} different channel numbers, got {channels}")
     if state is not None:
-        theirs = f"model {state.model}, channels {state.channels} of {state.height}x{state.width} pixels"
-        ours = f"model {model}, channels {channels} of {frames.shape[2]}x{frames.shape[3]} pixels"
+        theirs = f"model {state.model}, {len(state.pixels)} channels of {state.height}x{state.width} pixels"
+        ours = f"model {model}, {frames.shape[1]} channels of {frames.shape[2]}x{frames.shape[3]} pixels"
         if theirs != ours:
             raise ValueError(f"emulate: expected a state of {ours}, got one of {theirs}")

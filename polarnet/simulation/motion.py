@@ -1,14 +1,14 @@
 """Motion of a sensor over a scene: closed-form trajectories of bounded speed and acceleration, and rendering."""
 
-import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 from torch import Tensor
 
 from polarnet.runtime.compilation import compiled, inlined
@@ -109,29 +109,10 @@ class Trajectory:
             zoom=1 + self.zoom.amplitude + self.zoom.at(t_s),
         )
 
-    @staticmethod
-    def vector_names() -> list[str]:
-        """Names of the coefficients in `to_vector`."""
-        sines = [f"{axis}_sine{k + 1}" for axis in "xy" for k in range(HARMONICS)] + ["roll", "zoom"]
-        coefficients = [f"{sine}.{number.name}" for sine in sines for number in dataclasses.fields(Sine)]
-        return ["x", "y", *coefficients, "speed_px_s"]
-
-    def to_vector(self) -> Float64[np.ndarray, " n"]:
-        """All coefficients, in the order of the fields; their number is fixed."""
-        sines = (*self.x_sines, *self.y_sines, self.roll, self.zoom)
-        coefficients = [number for sine in sines for number in dataclasses.astuple(sine)]
-        return np.array([self.x, self.y, *coefficients, self.speed_px_s])
-
     @classmethod
-    def from_vector(cls, vector: Float64[np.ndarray, " n"]) -> "Trajectory":
-        """The trajectory with the coefficients of `to_vector`, exactly; ValueError for another number of them."""
-        length = len(cls.vector_names())
-        if vector.shape != (length,):
-            raise ValueError(f"a trajectory has {length} coefficients, got an array of shape {vector.shape}")
-        x, y, *coefficients, speed_px_s = vector.tolist()
-        sines = [Sine(*coefficients[i : i + 3]) for i in range(0, len(coefficients), 3)]
-        x_sines, y_sines = tuple(sines[:HARMONICS]), tuple(sines[HARMONICS : 2 * HARMONICS])
-        return cls(x, y, x_sines, y_sines, sines[-2], sines[-1], speed_px_s)
+    def from_record(cls, record: Mapping[str, Any]) -> "Trajectory":
+        """The trajectory of which `dataclasses.asdict` makes this record, exactly; ValueError for another record."""
+        return TypeAdapter(cls).validate_python(record)
 
 
 def resting_trajectory(height: int, width: int) -> Trajectory:

@@ -16,7 +16,7 @@ from polarnet.events.stream import Events
 from polarnet.simulation.camera import (
     Camera,
     PolarizersConfig,
-    channel_size,
+    grid,
     mixed_with_neighbours,
     read_out,
     split_cells,
@@ -28,7 +28,6 @@ from polarnet.simulation.pixels.light import FULL_SCALE, Light
 from polarnet.simulation.scene import PolarizationScene
 from polarnet.stokes import parse_mosaic
 
-NUMBERS = (0, 1, 2, 3)  # of the channels behind the polarizers at 0, 45, 90 and 135 degrees
 Size = tuple[int, int]
 Times = Int64[np.ndarray, " _n"]
 Reals = Float64[np.ndarray, " _n"]
@@ -63,13 +62,13 @@ def emulate_motion(
 
 def leave_sensors(channels: list[Events], camera: Camera, duration_us: int) -> list[Events]:
     """Apply the readout to the four channels of a whole sequence: to four sensors, or to one DoFP sensor."""
-    readout, key = camera.readout, camera.key
-    if readout.perfect:
+    readout = camera.readout
+    if readout.max_events_per_s is None:
         return channels
     if camera.polarizers.layout == "dofp":
         mosaic = parse_mosaic(camera.polarizers.mosaic)
-        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, key, duration_us)[0], mosaic)
-    return [read_out(channel, readout, key + number, duration_us)[0] for number, channel in enumerate(channels)]
+        return split_mosaic(read_out(join_mosaic(channels, mosaic), readout, duration_us), mosaic)
+    return [read_out(channel, readout, duration_us) for channel in channels]
 
 
 def emulate_motion_steps(
@@ -98,7 +97,7 @@ def emulate_motion_steps(
 
 def channels_of(camera: Camera, size: Size) -> Channels:
     """The four channels of a camera with sensors of this size."""
-    return Channels(NUMBERS, *channel_size(camera.polarizers.layout, *size), camera.sensor, camera.key)
+    return Channels(*grid(camera.polarizers.layout, *size)[:2], camera.sensor, camera.key)
 
 
 def checked_pose(scene: PolarizationScene, trajectory: Trajectory, t_us: Times, size: Size, pitch: int = 1) -> Pose:

@@ -14,8 +14,8 @@ from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera, Grid, grid, read_out
-from polarnet.simulation.dataset import Emulated, Mapper, fill_store, motion_over, origin_of
 from polarnet.simulation.emulator import Channels, emulate_frames
+from polarnet.simulation.event_sets import Emulated, Mapper, fill_store, motion_over, origin_of
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, checked_pose, render_times_us, rendered_chunks
 from polarnet.simulation.scene import PolarizationScene
@@ -68,8 +68,8 @@ def emulate_rotating(
     pose = checked_pose(scene, trajectory, t_us, size, pixels.pitch)
     rendered = rendered_chunks(scene, pose, t_us, size)
     frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
-    (events,), _ = emulate_frames(Channels((0,), *size, sensor, camera.key), frames)
-    return read_out(events, camera.readout, camera.key, duration_us)[0]
+    (events,), _ = emulate_frames(Channels(*size, sensor, camera.key), frames)
+    return read_out(events, camera.readout, duration_us)
 
 
 def emulate_rotating_scenes(
@@ -77,7 +77,7 @@ def emulate_rotating_scenes(
 ) -> int:
     """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
 
-    Events are in the store's first channel; the other three are empty. `mapper` is as in `dataset.emulate_scenes`.
+    Events are in the store's first channel; the other three are empty. `mapper` is as in `event_sets.emulate_scenes`.
     """
     source = SceneStore.open(scenes)
     pixels = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)

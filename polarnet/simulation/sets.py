@@ -17,7 +17,7 @@ from polarnet.pictures.polarimetry import are_measurements, group_by_measurement
 from polarnet.runtime.files import SUMS, changed_files, code_digest, seal, sha256
 from polarnet.runtime.sections import section
 from polarnet.simulation.camera import Camera
-from polarnet.simulation.dataset import emulate_scenes
+from polarnet.simulation.event_sets import emulate_scenes
 from polarnet.simulation.motion import SynthesizeConfig
 from polarnet.simulation.truth import Synthesis, synthesize
 

@@ -20,7 +20,7 @@ from polarnet.pictures.polarimetry import read_intensities
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import generator_for, one_thread
 from polarnet.simulation import scene as scene_module
-from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, channel_size, grid, mixed_with_neighbours
+from polarnet.simulation.camera import IDEAL, Grid, PolarizersConfig, grid, mixed_with_neighbours
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.scene import (
     LIGHT_RANGE,
@@ -154,14 +154,14 @@ def _create(
     splits = {motion.sequence: motion.split for motion in motions}
     variant_of = {motion.sequence: motion.picture for motion in motions if motion.scene != motion.picture}
     masked = any(entry.masked_fraction for entry in entries)  # null for photographs
-    if masked and (crosstalk := synthesis.polarizers.max_crosstalk):
-        attributes["crosstalk"] = crosstalk
+    if masked and synthesis.polarizers.crosstalk:
+        attributes["crosstalk"] = synthesis.polarizers.crosstalk
     contents = Contents(splits, attributes, variant_of, masked, per_part)
     sensor = config.sensor_height, config.sensor_width
-    scene_store = SceneStore.create(scenes, contents, scene_of, sensor, Trajectory.vector_names())
+    scene_store = SceneStore.create(scenes, contents, scene_of, sensor)
     contents = replace(contents, attributes={**attributes, "scenes": scene_of})
-    size = channel_size(synthesis.polarizers.layout, *sensor)
-    frame_store = FrameStore.create(frames, contents, *size)
+    height, width, _ = grid(synthesis.polarizers.layout, *sensor)
+    frame_store = FrameStore.create(frames, contents, height, width)
     return scene_store, frame_store
 
 
@@ -176,9 +176,9 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
             planes = planes._replace(valid=None)
         scene = stretched(scene_from_polarization(planes.s0, planes.dolp, planes.aolp), dynamic_range)
         for sequence, *_, trajectory in over_scene:
-            scenes.write(sequence, planes, torch.from_numpy(trajectory.to_vector()), t_us[-1], dynamic_range)
+            scenes.write(sequence, planes, asdict(trajectory), t_us[-1], dynamic_range)
             if planes.valid is not None:
-                valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.max_crosstalk)
+                valid = valid_frames(planes.valid, trajectory, t_us, pixels, polarizers.crosstalk)
             frames.write(sequence, torch.tensor(t_us), *frames_of(scene, trajectory, t_us, *pixels), valid)
 
 

@@ -4,13 +4,13 @@ Rendering starts from the stored, quantised scene, so that truth and events agre
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 from pydantic import PositiveInt
 
-from polarnet.runtime.arrays import Array, as_tensor, check_same_shape
+from polarnet.runtime.arrays import as_tensor, check_same_shape
 from polarnet.storage.frames import Contents, Polarization, SplitStore, dequantise, quantise
 
 PLANES = ("s0", "dolp", "aolp")
@@ -20,33 +20,32 @@ CONVENTIONS = {
     "aolp": "angle of linear polarization in radians, [0, pi): value * pi / 65536",
     "valid": "whether the light of a pixel is known; saturation hides it",
     "picture_size": "height and width of a scene in pixels",
-    "trajectory": "how the sensor moves in a sequence: numbers named by the attribute trajectory_names",
+    "trajectory": "how the sensor moves in a sequence, as polarnet.simulation.motion.Trajectory",
     "duration_us": "length of a sequence in microseconds",
+    "dynamic_range": "brightest over darkest light of a scene whose s0 is logarithmic; missing: s0 is the light itself",
 }
 
 
 class SceneStore(SplitStore):
     """The scene of each sequence, and how the sensor moves over it; see `create` and `open`.
 
-    >>> import numpy as np
     >>> import torch
     >>> from polarnet.storage import Contents, SceneStore
     >>> from polarnet.storage.frames import Polarization
-    >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, (6, 9), ["x"])
-    >>> store.write("lake-00", Polarization(*torch.zeros(3, 12, 18)), np.zeros(1), duration_us=1_000_000)
+    >>> store = SceneStore.create("scenes.zarr", Contents({"lake-00": "test"}), {"lake-00": "lake"}, (6, 9))
+    >>> store.write("lake-00", Polarization(*torch.zeros(3, 12, 18)), {"x": 8.5, "y": 5.5}, duration_us=1_000_000)
     >>> store.finish()
     >>> SceneStore.open("scenes.zarr").read("lake-00").s0.shape
     torch.Size([12, 18])
     """
 
     FORMAT = "polarnet.scenes"
-    VERSION = 7
+    VERSION = 8
     chunk = 2**18  # pixels
     scene_of: dict[str, str]
     """Name of the scene of each sequence; several sequences may show one."""
     sensor_height: PositiveInt
     sensor_width: PositiveInt
-    trajectory_names: list[str]
 
     @classmethod
     def create(
@@ -55,7 +54,6 @@ class SceneStore(SplitStore):
         contents: Contents,
         scene_of: Mapping[str, str],
         sensor: tuple[int, int],
-        trajectory_names: Sequence[str],
     ) -> "SceneStore":
         """Create a store to write, or resume it; see `Store.create_parts`.
 
@@ -77,7 +75,6 @@ class SceneStore(SplitStore):
             scene_of=dict(scene_of),
             sensor_height=sensor[0],
             sensor_width=sensor[1],
-            trajectory_names=list(trajectory_names),
             conventions=CONVENTIONS,
         )
 
@@ -85,23 +82,20 @@ class SceneStore(SplitStore):
         self,
         sequence: str,
         scene: Polarization,
-        trajectory: Float64[Array, " k"],
+        trajectory: Mapping[str, Any],
         duration_us: int,
         dynamic_range: float | None = None,
     ) -> None:
         """Write the scene and the trajectory of the next sequence of a part; see `Store.append`.
 
-        With a `dynamic_range`, S0 is logarithmic and spans it. Arrays may be numpy or torch. TypeError for anything but
-        an array. ValueError for values out of range or not finite, integers, planes of different shapes, a scene of an
-        impossible size, or a mask in a store without one.
+        The trajectory is plain JSON. With a `dynamic_range`, S0 is logarithmic and spans it. Planes may be numpy or
+        torch. TypeError for anything but an array. ValueError for values out of range or not finite, integers, planes
+        of different shapes, a scene of an impossible size, or a mask in a store without one.
         """
-        names, trajectory = self.trajectory_names, as_tensor("trajectory", trajectory)
-        if len(trajectory) != len(names) or not trajectory.isfinite().all():
-            raise ValueError(f"{sequence}: expected {len(names)} finite numbers ({', '.join(names)}), got {trajectory}")
         if duration_us <= 0:
             raise ValueError(f"{sequence}: expected a duration above 0 us, got {duration_us}")
         record = {
-            "trajectory": trajectory.tolist(),
+            "trajectory": dict(trajectory),
             "duration_us": int(duration_us),
             "picture_size": list(scene.s0.shape),
         }
@@ -114,18 +108,6 @@ class SceneStore(SplitStore):
         size = self.record(sequence)["picture_size"]
         (columns,) = self.read_columns(sequence, [*PLANES, *["valid"] * self.masked])
         return Polarization(**{name: dequantise(name, pixels.reshape(size)) for name, pixels in columns.items()})
-
-    def trajectory(self, sequence: str) -> Float64[np.ndarray, " k"]:
-        """How the sensor moves: the numbers that `trajectory_names` names."""
-        return np.array(self.record(sequence)["trajectory"], np.float64)
-
-    def duration_us(self, sequence: str) -> int:
-        """Length of a sequence in microseconds."""
-        return self.record(sequence)["duration_us"]
-
-    def dynamic_range(self, sequence: str) -> float | None:
-        """Brightest over darkest light of a scene whose S0 is logarithmic; None if S0 is the light itself."""
-        return self.record(sequence).get("dynamic_range")
 
     def _pixels(self, name: str, scene: Polarization) -> dict[str, np.ndarray]:
         """The columns of a scene; ValueError for a scene that the store cannot hold."""

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from event_fixtures import events_of
 
-from polarnet.characterization.flicker import (
-    Flicker,
-    Increments,
-    deviation,
-    flicker_cycle,
-    pixel_thresholds,
-    thresholds_without_leak,
-)
+from polarnet.characterization.flicker import Flicker, Increments, flicker_cycle, thresholds_without_leak
 from polarnet.characterization.intervals import PixelEvents, by_pixel, intervals_of, undisturbed
 from polarnet.characterization.noise import (
     estimate_noise,
@@ -24,6 +17,7 @@ from polarnet.characterization.noise import (
     nominal_shot_noise_hz,
     rate_swing,
 )
+from polarnet.characterization.thresholds import deviation, pixel_thresholds
 from polarnet.simulation.presets import SENSORS
 
 PIXELS = 600

@@ -187,4 +187,4 @@ def test_a_photograph_in_adobe_rgb_is_converted_as_by_little_cms_and_an_srgb_pro
 @pytest.mark.parametrize("profile", [b"short", LAB, SRGB[:150], SRGB.replace(b"gTRC", b"none")])
 def test_a_profile_that_cannot_be_used_is_named(rgb8, profile):
     with pytest.raises(UnreadablePicture, match=r"profile cannot be used .*; convert the file to sRGB"):
-        srgb_of(rgb8.astype(np.float32) / 255, Picture(rgb8, profile, "", None, None, None))
+        srgb_of(rgb8.astype(np.float32) / 255, Picture(rgb8, profile, "", False, None, None))

@@ -16,6 +16,7 @@ from polarnet.config.sweep import sweep_points
 from polarnet.config.tree import load
 from polarnet.metrics.lpips import record_of
 from polarnet.pictures.dead_leaves import dead_leaves
+from polarnet.pictures.manifest import read_manifest
 from polarnet.simulation.scene import scene_from_rgb
 from studies.simulated_rig import RigConfig, write_rig
 
@@ -121,7 +122,7 @@ def paper(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.thorough
 def test_the_paper_experiment_goes_through_every_stage_and_leaves_its_figures(paper):
-    assert json.loads((paper / "images" / "manifest.json").read_text())["counts"]["train"] == 4  # of 8 photographs
+    assert read_manifest(paper / "images").counts["train"] == 4  # of 8 photographs
     networks = {name: json.loads((paper / "train" / name / "best.json").read_text()) for name in ("ours", "e2v")}
     assert {name: one["network"] for name, one in networks.items()} == {"ours": "paper", "e2v": "e2vid"}
     assert networks["ours"]["lpips"]["backbone"] == "vgg"

@@ -45,8 +45,7 @@ def write_images(folder):
         entries.append(
             ManifestEntry(
                 name=name, file=f"{name}.png", split=split, source=source, origin=f"https://example.org/{name}",
-                licence="CC0-1.0", author="<b>Ann</b>", sha256="0" * 64, bits=8, height=48, width=72,
-                source_height=48, source_width=72, colour_profile=None,
+                licence="CC0-1.0", author="<b>Ann</b>", sha256="0" * 64, height=48, width=72,
             )
         )  # fmt: skip
     write_manifest(Manifest(tuple(entries), (Skipped("broken.jpg", "cannot be read: ends early"),), 0, 0), folder)

@@ -1,4 +1,4 @@
-"""Hot and dead pixels: their share, their rate, their silence, and their independence of light and of pieces."""
+"""Hot pixels: their share, their rate, and the silence of those that never fire."""
 
 import dataclasses
 import math
@@ -47,18 +47,19 @@ def test_hot_pixels_have_the_configured_share_and_are_poisson_processes_of_eithe
 
 
 @pytest.mark.parametrize("model", list(MODELS))
-def test_dead_pixels_are_silent_and_the_others_fire_as_before(model):
+def test_hot_pixels_of_rate_0_are_dead_and_the_others_fire_as_before(model):
     config = dataclasses.replace(SENSORS["default"], model=model, shot_noise_rate_hz=5.0)
     frames, t_us = moving_bars(2), 3333 * torch.arange(12)
+    dead = dataclasses.replace(config, hot_pixel_share=0.2, hot_pixel_rate_hz=0.0)
     healthy, _ = emulate(frames, t_us, config, key=7)
-    partly, _ = emulate(frames, t_us, dataclasses.replace(config, dead_pixel_share=0.2), key=7)
+    partly, _ = emulate(frames, t_us, dead, key=7)
     silent = []
     for before, after in zip(healthy, partly, strict=True):
-        dead = np.setdiff1d(places_of(before), places_of(after))
+        lost = np.setdiff1d(places_of(before), places_of(after))
         firing = len(np.unique(places_of(before)))
-        assert len(dead) == pytest.approx(0.2 * firing, abs=3 * math.sqrt(0.16 * firing))
-        alive = torch.from_numpy(~np.isin(places_of(before), dead))
+        assert len(lost) == pytest.approx(0.2 * firing, abs=3 * math.sqrt(0.16 * firing))
+        alive = torch.from_numpy(~np.isin(places_of(before), lost))
         for name in "txyp":
             assert torch.equal(getattr(after, name), getattr(before, name)[alive])
-        silent.append(dead)
+        silent.append(lost)
     assert not np.array_equal(*silent)  # each channel has its own

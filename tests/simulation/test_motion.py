@@ -1,6 +1,7 @@
 """Trajectories keep their promises for all times, and the window sees what the scene holds."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -71,12 +72,13 @@ def test_the_drawn_peak_speed_is_really_reached_within_the_sequence(seed):
     assert CONFIG.speed_min_px_s <= trajectory.speed_px_s <= CONFIG.speed_max_px_s
 
 
-def test_a_trajectory_survives_the_way_through_its_vector_to_the_last_bit():
+def test_a_trajectory_survives_the_way_through_json_to_the_last_bit():
     config = dataclasses.replace(CONFIG, rotation_max_deg=10.0, zoom_max=1.5)
     trajectory = random_trajectory(config, 400, 600, np.random.default_rng(0))
-    assert Trajectory.from_vector(trajectory.to_vector()) == trajectory
-    with pytest.raises(ValueError, match="27 coefficients"):
-        Trajectory.from_vector(np.zeros(5))
+    record = json.loads(json.dumps(dataclasses.asdict(trajectory)))
+    assert Trajectory.from_record(record) == trajectory
+    with pytest.raises(ValueError, match="roll"):
+        Trajectory.from_record({**record, "roll": None})
 
 
 def test_a_scene_too_small_for_the_window_is_refused_and_a_small_one_lowers_the_speed():

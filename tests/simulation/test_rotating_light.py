@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -71,11 +71,11 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     config = load(project_root, ["rotating.frames_per_turn=32"])
     names = {"lake-00": "lake", "wood-00": "wood"}
     contents = Contents({"lake-00": "train", "wood-00": "test"}, {"layout": "four_sensors"})
-    store = SceneStore.create(tmp_path / "scenes.zarr", contents, names, (6, 8), Trajectory.vector_names())
+    store = SceneStore.create(tmp_path / "scenes.zarr", contents, names, (6, 8))
     trajectory = Trajectory(12.0, 10.0, (Sine(2.0, 5.0, 0.0), STILL, STILL), REST, STILL, STILL, 10.0)
     maps = torch.rand(3, 20, 30, generator=torch.Generator().manual_seed(1))
     for name in names:
-        store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), trajectory.to_vector(), 100_000)
+        store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), asdict(trajectory), 100_000)
     store.finish()
     arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.rotating, config.camera, config.seed, map
     assert emulate_rotating_scenes(*arguments) == 1

@@ -13,7 +13,6 @@ from polarnet import stokes
 from polarnet.simulation import SENSORS, PolarizationScene, scene_from_polarization
 from polarnet.simulation.camera import (
     IDEAL,
-    PERFECT,
     Camera,
     PolarizersConfig,
     pixel_analyzers,
@@ -117,11 +116,8 @@ def test_pixels_that_are_alike_have_one_analyzer_a_channel(polarizers):
 
 @pytest.mark.parametrize("key", [2**64 - 1, -1])
 def test_keys_count_modulo_2_to_the_64(key):
-    polarizers, readout = (
-        dataclasses.replace(IDEAL, angle_spread_deg=1.0),
-        dataclasses.replace(PERFECT, jitter_us=50.0),
-    )
-    cameras = [Camera(SENSORS["noisy"], polarizers, readout, k) for k in (key, key % 2**64)]
+    polarizers = dataclasses.replace(IDEAL, angle_spread_deg=1.0)
+    cameras = [Camera(SENSORS["noisy"], polarizers, key=k) for k in (key, key % 2**64)]
     rest = resting_trajectory(20, 30)
     ours, same = (emulate_motion(one, uniform_scene(0.5, 30.0), rest, 500_000, (20, 30)) for one in cameras)
     assert min(map(len, ours)) > 100

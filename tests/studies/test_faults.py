@@ -20,8 +20,8 @@ FAULTS = 45
 
 def picture(name):
     return ManifestEntry(
-        name=name, file=f"{name}.png", split="train", source="folder", origin=name, sha256="0" * 64, bits=8,
-        height=8, width=12, source_height=8, source_width=12,
+        name=name, file=f"{name}.png", split="train", source="folder", origin=name, sha256="0" * 64,
+        height=8, width=12,
     )  # fmt: skip
 
 

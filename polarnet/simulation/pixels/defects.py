@@ -1,51 +1,31 @@
-"""Hot and dead pixels of a channel: hot ones fire at random times whatever their light, dead ones never fire.
+"""Hot pixels of a channel, which fire at random times whatever their light, and lose the events of their light.
 
-Both kinds lose the events of their own light. Those of a hot pixel are a Poisson process, which has no memory: each
-span of time draws its own (`columns.write_in_order`), so a clip that is continued needs no state of its hot pixels.
+Their events are a Poisson process, which has no memory: each span of time draws its own (`columns.write_in_order`), so
+a clip that is continued needs no state of its hot pixels.
 """
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from polarnet.runtime.compilation import compiled
-from polarnet.runtime.sections import section
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.physics import MAX_RATE_HZ
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
-
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-@section
-class DefectsConfig:
-    """Hot and dead pixels, for every pixel model."""
-
-    hot_pixel_share: Share
-    """Probability that a pixel is hot: it fires at random times, whatever its light."""
-    hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
-    """Events per second of a hot pixel, ON and OFF together."""
-    dead_pixel_share: Share
-    """Probability that a pixel is dead: it never fires."""
 
 
 class Defects(NamedTuple):
-    """Defective pixels of a channel."""
+    """Hot pixels of a channel."""
 
-    hot: np.ndarray  # int64, indices of the hot pixels, rising
+    hot: np.ndarray  # int64, their indices, rising
     silent: np.ndarray  # bool [h * w], whether a pixel's own events are dropped; empty for a sensor without defects
     rate_hz: float
     round_up: bool  # whether the pixel model stamps an event after the start of its step and up to its end
 
 
-def defects_of(config: DefectsConfig, pixels: int, key: np.uint64, channel: int, round_up: bool) -> Defects:
-    """The defective pixels of a channel; a pixel drawn as both kinds is dead."""
-    if config.hot_pixel_share == 0 and config.dead_pixel_share == 0:
-        return Defects(np.empty(0, np.int64), np.empty(0, np.bool_), config.hot_pixel_rate_hz, round_up)
-    dead = _chosen(key, randomness.DEAD, channel, pixels, config.dead_pixel_share)
-    hot = _chosen(key, randomness.HOT, channel, pixels, config.hot_pixel_share) & ~dead
-    return Defects(np.flatnonzero(hot), hot | dead, config.hot_pixel_rate_hz, round_up)
+def defects_of(share: float, rate_hz: float, pixels: int, key: np.uint64, channel: int, round_up: bool) -> Defects:
+    """The hot pixels of a channel: each pixel with probability `share`."""
+    hot = _chosen(key, randomness.HOT, channel, pixels, share) if share > 0 else np.empty(0, np.bool_)
+    return Defects(np.flatnonzero(hot), hot, rate_hz, round_up)
 
 
 @compiled

@@ -4,15 +4,15 @@ All constants are the paper's, in microseconds and thresholds: an event fires wh
 """
 
 import math
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from polarnet.runtime.compilation import ZERO, compiled
-from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import intensity_rows
+from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
@@ -31,18 +31,7 @@ class Physics(NamedTuple):
     k6: float  # noise that does not depend on light
 
 
-CAMERAS = {
-    "dvs346": Physics(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5),
-    "dvs240": Physics(4.424, 23.0, 2e-4, 1e-7, 5e-8, 1e-5),
-}
-
-
-@section
-class VoltmeterConfig:
-    """Parameters of DVS-Voltmeter's pixel."""
-
-    voltmeter_camera: Annotated[str, one_of(CAMERAS)]
-    """Camera whose fitted constants are used."""
+DVS346 = Physics(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
 
 
 class Pixels(NamedTuple):
@@ -52,9 +41,9 @@ class Pixels(NamedTuple):
     voltage: np.ndarray  # float64, change since the last event, in thresholds
 
 
-def physics_of(config: VoltmeterConfig) -> Physics:
-    """The constants of the configured camera."""
-    return CAMERAS[config.voltmeter_camera]
+def physics_of(_config: PixelConfig) -> Physics:
+    """The constants fitted to the DVS346, whatever the configured parameters."""
+    return DVS346
 
 
 def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:

@@ -1,4 +1,4 @@
-"""Emulation of a scene store: into an event store, part by part so that a run can resume."""
+"""Event sets: every sequence of a scene store, emulated into an event store part by part, so that a run can resume."""
 
 import functools
 from collections.abc import Callable, Iterable
@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from polarnet.events.stream import Events
-from polarnet.simulation.camera import Camera, channel_size, pixel_analyzers
+from polarnet.simulation.camera import Camera, grid, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
@@ -32,9 +32,9 @@ def emulate_scenes(
     camera, depend only on the seed and the sequence's name.
     """
     source = SceneStore.open(scenes)
-    size = channel_size(camera.polarizers.layout, source.sensor_height, source.sensor_width)
+    height, width, _ = grid(camera.polarizers.layout, source.sensor_height, source.sensor_width)
     store = EventStore.create(
-        events, source.sequences, *size, origin_of(source, camera, seed), source.sequences_per_part
+        events, source.sequences, height, width, origin_of(source, camera, seed), source.sequences_per_part
     )
     return fill_store(store, functools.partial(_emulated, source, camera, seed, threads), mapper)
 
@@ -66,7 +66,7 @@ def _emulated(scenes: SceneStore, camera: Camera, seed: int, threads: int, seque
 
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:
     """The scene of a stored sequence, the motion over it, and its duration in microseconds."""
-    stored = scenes.read(sequence)
+    stored, record = scenes.read(sequence), scenes.record(sequence)
     scene = scene_from_polarization(stored.s0, stored.dolp, stored.aolp)
-    scene = stretched(scene, scenes.dynamic_range(sequence))
-    return scene, Trajectory.from_vector(scenes.trajectory(sequence)), scenes.duration_us(sequence)
+    scene = stretched(scene, record.get("dynamic_range"))
+    return scene, Trajectory.from_record(record["trajectory"]), record["duration_us"]
