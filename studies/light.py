@@ -20,7 +20,7 @@ from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.sequence import simulate
-from studies.simulation_pictures import QUIET
+from studies.pictures import QUIET
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 RESPONSES: dict[str, dict[str, Any]] = {

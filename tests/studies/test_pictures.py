@@ -3,11 +3,11 @@
 import pytest
 
 from polarnet.simulation.presets import SENSORS
-from studies import physics_pictures, simulation_pictures
+from studies import pictures
 from studies.camera import FINE, analyzer_errors
 
 
-@pytest.mark.parametrize("name", [*simulation_pictures.FIGURES, *physics_pictures.FIGURES])
+@pytest.mark.parametrize("name", pictures.FIGURES)
 def test_a_picture_lies_beside_the_page_that_shows_it(project_root, name):
     assert any(f"pictures/{name}.png" in page.read_text() for page in (project_root / "docs").glob("*.md"))
     assert (project_root / "docs" / "pictures" / f"{name}.png").stat().st_size < 300_000
