@@ -8,8 +8,6 @@
 - simulation: events of one drifting sensor (`studies.simulation_run`). Times are medians of wall-clock time. Every
   model and number of threads runs in its own process; the processes take turns, so that other load affects all of them
   alike. --write: docs/results/emulation.json.
-- simulation with --before CHECKOUT: processor time of v2e and exact on one thread, of both checkouts in turns.
-  --write: docs/results/speed.json, section simulation_turns.
 - live: `polarnet recover` of a million random events a second on 260 x 346 pixels, with every output and with numbers
   alone. From a store: how many times as fast as real time. `--live`, `--seconds` (60) of lines through a pipe: latency,
   joined windows, and memory in the second and the last third of the time. --write: docs/results/speed.json.
@@ -41,7 +39,6 @@ from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
-from studies import simulation_run
 from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
 
 SIZES = ((120, 180), (260, 346), (480, 640))
@@ -54,7 +51,7 @@ WINDOW_US = round(1e6 / 30)
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
 LIVE_SIZE, EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = (260, 346), 1_000_000, 100, 10, 10
-ROUNDS, PAIRS = 3, 12  # processes of each model and number of threads; of each checkout
+ROUNDS = 3  # processes of each checkout, of each model and number of threads
 
 
 def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
@@ -109,52 +106,28 @@ def measure_network(threads: int) -> dict[str, Any]:
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
 
 
-def in_turns(before: Path, rounds: int, *script: object) -> dict[Path, list[dict[str, Any]]]:
-    """What a script of this checkout prints as JSON with the packages of `before` and with those of this one, in turns.
+def measure_turns(before: Path, threads: int) -> dict[str, Any]:
+    """Medians of windows a second of the checkout `before` and of this one, and their ratios.
 
-    Each checkout goes first in every other round.
+    The network of each runs in processes of its own, in turns; each checkout goes first in every other round.
     """
     turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
-    for number in range(rounds):
+    for number in range(ROUNDS):
         for root in list(turns)[:: (-1) ** number]:
             environment = {**os.environ, "PYTHONPATH": str(root)}
-            command = [sys.executable, *map(str, script)]
+            command = [sys.executable, __file__, "--sizes", str(threads)]
             done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-            turns[root].append(json.loads(done.stdout.splitlines()[-1]))
-    return turns
-
-
-def measure_turns(before: Path, threads: int) -> dict[str, Any]:
-    """Medians of windows a second of the checkout `before` and of this one, which take turns, and their ratios."""
-    turns = in_turns(before, ROUNDS, __file__, "--sizes", threads)
+            turns[root].append(json.loads(done.stdout.splitlines()[-1])["sizes"])
 
     def medians(root: Path, size: str) -> dict[str, float]:
-        return {kind: float(np.median([one["sizes"][size]["pixels"][kind] for one in turns[root]])) for kind in KINDS}
+        return {kind: float(np.median([sizes[size]["pixels"][kind] for sizes in turns[root]])) for kind in KINDS}
 
-    sizes = {}
-    for size in turns[ROOT][0]["sizes"]:
+    figures = {}
+    for size in turns[ROOT][0]:
         old, new = medians(before, size), medians(ROOT, size)
-        sizes[size] = {"before": old, "now": new, "speedup": {kind: round(new[kind] / old[kind], 2) for kind in KINDS}}
-    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": sizes}
-
-
-def measure_simulation_turns(before: Path) -> dict[str, Any]:
-    """Processor time of a run by model on one thread, of the checkout `before` and of this one, and their ratios.
-
-    A ratio is the median of those of the processes that ran one after the other.
-    """
-    figures: dict[str, Any] = {"commit_before": git(before, "rev-parse", "HEAD"), "pairs": PAIRS}
-    for model in MODELS[:2]:
-        turns = in_turns(before, PAIRS, simulation_run.__file__, model, 1)
-        old, new = (np.array([np.median(one["cpu_seconds"]) for one in turns[root]]) for root in (before, ROOT))
-        events = {str(one["events"]) for root in turns for one in turns[root]}
-        figures[model] = {
-            "cpu_seconds_before": round(float(np.median(old)), 4),
-            "cpu_seconds": round(float(np.median(new)), 4),
-            "time_over_before": round(float(np.median(new / old)), 3),
-            "events": "equal in number" if len(events) == 1 else "of other numbers",
-        }
-    return figures
+        speedup = {kind: round(new[kind] / old[kind], 2) for kind in KINDS}
+        figures[size] = {"before": old, "now": new, "speedup": speedup}
+    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": figures}
 
 
 def measure_models() -> dict[str, dict[str, Any]]:
@@ -249,12 +222,6 @@ def main() -> None:
     arguments = arguments_of(parser)
     if arguments.sizes:
         print(json.dumps(measure_network(int(arguments.sizes))))
-        return
-    if arguments.before and arguments.only == "simulation":
-        record, turns = machine_record(), measure_simulation_turns(arguments.before)
-        print(json.dumps(turns, indent=1))
-        if arguments.write:
-            write_section("speed", "simulation_turns", turns, record)
         return
     if arguments.before:
         record, turns = machine_record(), measure_turns(arguments.before, arguments.threads)
