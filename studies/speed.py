@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, flo
     rates = {}
     for name, size, runs in (("file", recoverer.at_once(height, width), RUNS), ("camera", 1, TIMED_WINDOWS)):
         count = size * (WARM_RUNS + runs)
-        windows = windows_of(random_channels(height, width, count), count)
+        windows = random_windows(height, width, count)
         state = recoverer.start(height, width)
         for number in range(WARM_RUNS + runs):
             if number == WARM_RUNS:
@@ -73,8 +73,8 @@ def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, flo
     return rates
 
 
-def random_channels(height: int, width: int, windows: int) -> list[Events]:
-    """Events of four channels, as long as this number of windows: random points that move to the right."""
+def random_windows(height: int, width: int, windows: int) -> list[EventWindow]:
+    """Windows of four channels, one after the other: random points that move to the right."""
     generator = np.random.default_rng(0)
     count = round(EVENTS_PER_PIXEL * height * width)
     number = np.repeat(np.arange(windows), count)
@@ -85,13 +85,8 @@ def random_channels(height: int, width: int, windows: int) -> list[Events]:
         p = np.tile(generator.choice([-1, 1], count), windows)
         return Events.from_columns(t, (x + SHIFT * number) % width, y, p, height, width)
 
-    return [random_channel() for _ in range(4)]
-
-
-def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
-    """The first windows of the channels, one after the other."""
-    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
-    return list(cutter.add(channels, windows * WINDOW_US))
+    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
+    return list(cutter.add([random_channel() for _ in range(4)], windows * WINDOW_US))
 
 
 def measure_network(threads: int) -> dict[str, Any]:
