@@ -194,6 +194,7 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
         thorough(put("loss", mse=12.0), {"train", "report"}),
         thorough(put("benchmark", bootstrap_samples=100), {"report"}),
         thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"}),
+        thorough(lambda params: params["rows"].pop("highpass"), {"emulate_rotating", "report"}),
     ],
 )  # fmt: skip
 def test_a_changed_value_runs_what_it_can_change(project, change, stages):
@@ -215,9 +216,3 @@ def test_new_content_of_a_file_that_a_value_names_runs_the_stage_that_reads_it(p
     repro()
     (project / file).write_text("another")
     assert repro() == stages
-
-
-@pytest.mark.thorough
-def test_a_row_that_is_removed_runs_no_other_row(project):
-    set_params(project, lambda params: params["rows"].pop("highpass"))
-    assert repro() == {"emulate_rotating", "report"}
