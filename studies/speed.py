@@ -101,8 +101,8 @@ def measure_network(threads: int) -> dict[str, Any]:
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
 
 
-def measure_turns(before: Path, threads: int) -> dict[str, Any]:
-    """Medians of windows a second of the checkout `before` and of this one, and their ratios.
+def measure_turns(before: Path, threads: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Medians of windows a second of the checkout `before` and of this one, and their ratios; the latter by size.
 
     The network of each runs in processes of its own, in turns; each checkout goes first in every other round.
     """
@@ -122,7 +122,8 @@ def measure_turns(before: Path, threads: int) -> dict[str, Any]:
         old, new = medians(before, size), medians(ROOT, size)
         speedup = {kind: round(new[kind] / old[kind], 2) for kind in KINDS}
         figures[size] = {"before": old, "now": new, "speedup": speedup}
-    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": figures}
+    headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in figures.items()}
+    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": figures}, headlines
 
 
 def measure_models() -> dict[str, dict[str, Any]]:
@@ -143,8 +144,11 @@ def measure_models() -> dict[str, dict[str, Any]]:
     }
 
 
-def measure_live(seconds: int) -> dict[str, Any]:
-    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs."""
+def measure_live(seconds: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs.
+
+    Headlines are those with every output.
+    """
     generator, size = np.random.default_rng(0), dict(zip(("height", "width"), LIVE_SIZE, strict=True))
     y, x, p, k = (generator.integers(0, limit, EVENTS_PER_S) for limit in (*LIVE_SIZE, 2, 4))
     t = np.arange(EVENTS_PER_S) * 1_000_000 // EVENTS_PER_S
@@ -173,7 +177,8 @@ def measure_live(seconds: int) -> dict[str, Any]:
                 "frames": re.findall(r"(?m)^(?:frames|joined) +(.+)$", facts),
                 "resident_mib": {"second third": max(resident_mib[third:-third]), "last": max(resident_mib[-third:])},
             }
-    return figures
+    factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
+    return figures, {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
 
 
 def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
@@ -218,27 +223,17 @@ def main() -> None:
     if arguments.sizes:
         print(json.dumps(measure_network(int(arguments.sizes))))
         return
-    if arguments.before:
-        record, turns = machine_record(), measure_turns(arguments.before, arguments.threads)
-        print(json.dumps(turns, indent=1))
-        if arguments.write:
-            headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in turns["sizes"].items()}
-            write_section("speed", "turns", turns, record, headlines)
-        return
-    studies: dict[str, tuple[str, str, Callable[[], dict[str, Any]]]] = {
-        "network": ("robustness", "speed", lambda: measure_network(arguments.threads)),
-        "simulation": ("emulation", "models", measure_models),
+    studies: dict[str, tuple[str, str, Callable[[], tuple[dict[str, Any], dict[str, Any]]]]] = {
+        "network": ("robustness", "speed", lambda: (measure_network(arguments.threads), {})),
+        "simulation": ("emulation", "models", lambda: (measure_models(), {})),
         "live": ("speed", "live", lambda: measure_live(arguments.seconds)),
     }
+    if arguments.before:
+        studies = {"network": ("speed", "turns", lambda: measure_turns(arguments.before, arguments.threads))}
     for kind, (name, section, measure) in studies.items():
         if arguments.only in (None, kind):
-            record = machine_record()
-            figures = measure()
+            record, (figures, headlines) = machine_record(), measure()
             print(json.dumps(figures, indent=1), flush=True)
-            headlines = {}
-            if kind == "live":
-                factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
-                headlines = {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
             if arguments.write:
                 write_section(name, section, figures, record, headlines)
 
