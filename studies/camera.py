@@ -23,7 +23,7 @@ from polarnet.simulation.emulator import EmulatorConfig
 from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
 from polarnet.simulation.presets import POLARIZERS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
-from studies.simulation_pictures import QUIET
+from studies.pictures import QUIET
 from studies.study import ROOT, arguments_of, command_line, machine_record, outcomes, write_section
 
 SIZE = (12, 16)  # rows and columns of the calibrated sensor

@@ -25,7 +25,8 @@ from typing import Any
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parents[1]
-MARKER = re.compile(r"<!-- (?P<end>/?)results:(?P<name>[\w-]+) -->")
+BLOCK = re.compile(r"(<!-- results:([\w-]+) -->).*?(<!-- /results:\2 -->)", re.DOTALL)
+MARKER = re.compile(r"<!-- /?results:(?P<name>[\w-]+) -->")
 KEYS = {"file", "section", "rows", "without", "columns", "caption"}
 
 ROOT_OF = "rms"
@@ -175,18 +176,16 @@ def update_pages(root: Path, check: bool) -> list[Path]:
 
 
 def _with_blocks(text: str, page: Path, tables: Mapping[str, Mapping[str, Any]], root: Path) -> str:
-    parts, position = [], 0
-    markers = list(MARKER.finditer(text))
-    for start, stop in zip(markers[::2], [*markers[1::2], None], strict=False):
-        name = start["name"]
-        if start["end"] or stop is None or not stop["end"] or stop["name"] != name:
-            raise ValueError(f"{page}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
+    def rewritten(block: re.Match[str]) -> str:
+        start, name, end = block.groups()
         if name not in tables:
             raise ValueError(f"{page}: docs/tables.yaml has no block {name}; expected one of {', '.join(tables)}")
-        block = block_text(tables[name], read_file(root, tables[name]["file"]))
-        parts += [text[position : start.end()], "\n\n", block, "\n\n"]
-        position = stop.start()
-    return "".join([*parts, text[position:]])
+        return f"{start}\n\n{block_text(tables[name], read_file(root, tables[name]['file']))}\n\n{end}"
+
+    if open_marker := MARKER.search(BLOCK.sub("", text)):
+        name = open_marker["name"]
+        raise ValueError(f"{page}: expected <!-- results:{name} --> ... <!-- /results:{name} -->; close each block")
+    return BLOCK.sub(rewritten, text)
 
 
 def main() -> int:

@@ -350,7 +350,7 @@ def main() -> None:
         record, figures = machine_record(), studies[name]()
         print(name, json.dumps(figures, indent=2))
         if arguments.write:
-            known = {**read_results(ROOT, "reliability"), name: figures}
+            known = {**read_results("reliability"), name: figures}
             write_section("reliability", name, figures, record, headlines(known))
 
 

@@ -20,7 +20,7 @@ from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.sequence import simulate
-from studies.simulation_pictures import QUIET
+from studies.pictures import QUIET
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 RESPONSES: dict[str, dict[str, Any]] = {
@@ -65,19 +65,13 @@ def dolp_error(dark_dn: float | None, dimmed: float) -> float:
 
 def main() -> None:
     """The command line."""
-    parser = command_line(__doc__, "docs/results/light.json")
-    parser.add_argument("--events", action="store_true", help="only the events, which take seconds")
-    arguments, record = arguments_of(parser), machine_record()
+    write, record = arguments_of(command_line(__doc__, "docs/results/light.json")).write, machine_record()
     tune()
     events = {label: events_by_light(replace(QUIET, **changes)) for label, changes in RESPONSES.items()}
-    print(json.dumps(events))
-    if arguments.write:
-        write_section("light", "events", {"levels_dn": LEVELS_DN.tolist(), "per_second": events}, record)
-    if arguments.events:
-        return
     dolp = {str(dark): {str(dimmed): dolp_error(dark, dimmed) for dimmed in DIMMED} for dark in DARK_DN}
-    print(json.dumps(dolp, indent=1))
-    if arguments.write:
+    print(json.dumps({"events": events, "dolp": dolp}, indent=1))
+    if write:
+        write_section("light", "events", {"levels_dn": LEVELS_DN.tolist(), "per_second": events}, record)
         write_section("light", "dolp", {"scenes": SCENES, "mse": dolp}, record)
 
 

@@ -1,39 +1,23 @@
-"""Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole.
+"""Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole."""
 
-Each command runs in a fork of this process, which has imported the libraries, as do the stages that `stages.trial` and
-`dvc repro` start; the rest is as in a shell.
-"""
-
-import faulthandler
-import importlib
 import itertools
-import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
-import dvc.cli
-import dvc.stage.run
-import torch
-from dvc.stage.exceptions import StageCmdFailedError
-from hydra.core.global_hydra import GlobalHydra
 from ruamel.yaml import YAML
 
-from polarnet import cli
-from polarnet.cli import recover, simulate, stores  # noqa: F401 (so that forks need not import them)
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.files import files_of, sha256
 from polarnet.runtime.machine import generator_for
 from polarnet.storage.events import EventStore
 
-FORK = multiprocessing.get_context("fork")
 PLACE = "data/train/ours"
 """Where every command writes: `dvc repro train` writes nowhere else."""
 STORE = "data/events.zarr"
@@ -46,72 +30,41 @@ TINY: dict[str, dict[str, Any]] = {
     "baselines": {"e2v": {"crop": [24, 32], "lpips": 0}},
 }
 """Values of params.yaml that make a training short."""
-STUDY = os.getpid()
-MAX_DELAY_S = 6.0
-STUCK_S = 120
+MAX_DELAY_S = 12.0
+STUCK_S = 300
 """A command that takes longer does not end."""
-TO_PLACE = ["--out", PLACE]
+POLARNET, TO_PLACE = "polarnet.cli", ["--out", PLACE]
 COMMANDS: dict[str, tuple[list[str], list[str], tuple[str, ...]]] = {
     "recover": (
-        ["recover", STORE, "--method", "cf", "--write", "zarr", *TO_PLACE],
+        [POLARNET, "recover", STORE, "--method", "cf", "--write", "zarr", *TO_PLACE],
         ["--sequence=FIRST", "--sequence=LAST"],
         ("recovered.zarr",),
     ),
     "simulate": (
-        ["simulate", str(BUILTIN_PHOTOS[0].path), "--no-preview", *TO_PLACE, *SMALL],
+        [POLARNET, "simulate", str(BUILTIN_PHOTOS[0].path), "--no-preview", *TO_PLACE, *SMALL],
         ["seed=1", "seed=2"],
         ("events.zarr", "truth.zarr"),
     ),
-    "demo": (["demo", *TO_PLACE, *SMALL], ["seed=1", "seed=2"], ("simulated/events.zarr", "recovered/recovered.zarr")),
-    "view": (["view", STORE, "--no-browser", *TO_PLACE], ["--sequence=FIRST", "--sequence=LAST"], ("",)),
+    "demo": (
+        [POLARNET, "demo", *TO_PLACE, *SMALL],
+        ["seed=1", "seed=2"],
+        ("simulated/events.zarr", "recovered/recovered.zarr"),
+    ),
+    "view": ([POLARNET, "view", STORE, "--no-browser", *TO_PLACE], ["--sequence=FIRST", "--sequence=LAST"], ("",)),
     "trial": (["stages.trial", f"hydra.run.dir={PLACE}", "benchmark.methods=[ours]"],
               ["loss.mse=1.0", "loss.mse=2.0"], ("train/ours", "finished.json")),
     "dvc repro": (["dvc", "repro", "-f", "-s", "--no-run-cache", "--no-commit", "train"], ["", ""], ("",)),
 }  # fmt: skip
-"""Words of each command, words that make two results differ, and the files or folders that hold a result."""
+"""Words after `python -m`, words that make two results differ, and the files or folders that hold a result."""
 
 
-def start(words: Sequence[str], output: Path) -> Any:
-    """A process that runs a command and writes its messages into a file."""
-    process = FORK.Process(target=run, args=([word for word in words if word], output))
-    process.start()
-    return process
-
-
-def run(words: list[str], output: Path) -> None:
-    """Run a command in this process, which ends; SIGUSR1 shows where it is."""
-    if os.getppid() == STUDY:
-        os.setpgrp()  # so that it can be killed with the processes that it starts
-    descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    for standard in (1, 2):
-        os.dup2(descriptor, standard)
-    faulthandler.register(signal.SIGUSR1, file=descriptor)
-    name, *arguments = words
-    sys.argv = words
-    if name.startswith("stages."):
-        GlobalHydra.instance().clear()  # of a trial, if this is one of its stages
-        with mock.patch("stages.trial._failure", stage_failure):
-            sys.exit(sys.modules[name].main())
-    if name == "dvc":
-        with mock.patch("dvc.stage.run._run", stage_or_raise):
-            sys.exit(dvc.cli.main(arguments))
-    sys.exit(cli.main(words))
-
-
-def stage_failure(command: Sequence[str]) -> str | None:
-    """In place of that of `stages.trial`: the stage runs in a fork."""
-    with tempfile.NamedTemporaryFile() as output:
-        process = start(command[2:], Path(output.name))
-        process.join()
-        message = Path(output.name).read_text()
-    print(message, file=sys.stderr)
-    return message.strip().splitlines()[-1] if process.exitcode else None
-
-
-def stage_or_raise(executable: str | None, command: str, **options: Any) -> None:
-    """In place of that of DVC: the stage runs in a fork."""
-    if stage_failure(command.split()):
-        raise StageCmdFailedError(command, 1)
+def start(name: str, variant: int, output: Path) -> subprocess.Popen:
+    """A process, the first of its own group, that runs a command and writes its messages into a file."""
+    words, further, _ = COMMANDS[name]
+    command = [sys.executable, "-m", *words, *filter(None, [further[variant]])]
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}  # in which DVC looks
+    with output.open("wb") as file:
+        return subprocess.Popen(command, stdout=file, stderr=file, env=environment, start_new_session=True)
 
 
 def result_of(name: str) -> str | None:
@@ -143,10 +96,6 @@ def prepare(run_folder: Path, scratch: Path) -> None:
     first, *_, last = EventStore.open(STORE).sequences
     for words in COMMANDS.values():
         words[1][:] = [word.replace("FIRST", first).replace("LAST", last) for word in words[1]]
-    sys.path.insert(0, str(scratch))  # so that the stages are those of the project, with its settings
-    for name in ("row", "train", "trial"):
-        importlib.import_module(f"stages.{name}")
-    torch.set_num_threads(1)
 
 
 def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
@@ -169,18 +118,15 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
             for variant in (0, 1):
                 clear()
                 began = time.monotonic()
-                process = start(words_of(name, variant), output)
-                process.join()
-                if process.exitcode:
+                if start(name, variant, output).wait():
                     raise SystemExit(f"{name} does not run alone:\n{output.read_text()[-3000:]}")
                 expected.setdefault(name, []).append(result_of(name))
                 seconds[name] = time.monotonic() - began
             print(name, f"{seconds[name]:.1f} s", flush=True)
         for number, (one, other) in itertools.product(range(cases), both):
             clear()
-            delay = generator_for(number, f"{one} and {other}", "delay").uniform(
-                0, min(1.2 * seconds[one], MAX_DELAY_S)
-            )
+            longest_s = min(1.2 * seconds[one], MAX_DELAY_S)
+            delay = generator_for(number, f"{one} and {other}", "delay").uniform(0, longest_s)
             what, message = outcome((one, other), delay, Path(folder), expected)
             counts[f"{one} and {other} at once"][what] += 1
             if what not in ("waited", "refused"):
@@ -189,37 +135,30 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
     return counts
 
 
-def words_of(name: str, variant: int) -> list[str]:
-    """Words of a command."""
-    words, further, _ = COMMANDS[name]
-    return [*words, further[variant]]
-
-
 def outcome(
     names: tuple[str, str], delay: float, folder: Path, expected: dict[str, list[str | None]]
 ) -> tuple[str, str]:
     """Outcome of two commands, and their messages."""
     outputs = [folder / "first", folder / "second"]
-    for output in outputs:
-        output.unlink(missing_ok=True)
-    first = start(words_of(names[0], 0), outputs[0])
+    processes = [start(names[0], 0, outputs[0])]
     time.sleep(delay)
-    processes = [first, start(words_of(names[1], 1), outputs[1])]
-    for process in processes:
-        process.join(STUCK_S)
-    if running := [process for process in processes if process.exitcode is None]:
-        for number, process in itertools.product((signal.SIGUSR1, signal.SIGKILL), running):
-            os.killpg(process.pid, number)
-            process.join(1)
+    processes.append(start(names[1], 1, outputs[1]))
+    try:
+        for process in processes:
+            process.wait(STUCK_S)
+    except subprocess.TimeoutExpired:
+        for process in processes:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
         return "stuck", "".join(output.read_text() for output in outputs)[-6000:]
     texts = [output.read_text() for output in outputs]
-    well = [name for name, process in zip(names, processes, strict=True) if process.exitcode == 0]
+    well = [name for name, process in zip(names, processes, strict=True) if process.returncode == 0]
     message = " | ".join(text.strip().splitlines()[-1] if text.strip() else "" for text in texts)
     if "Traceback" in "".join(texts):
         return "traceback", "".join(texts)[-3000:]
     if not any(result_of(name) in expected[name] for name in well):
         return "lost", f"{well} ended well, but left no whole result: {message}"
-    refusals = [text for text, process in zip(texts, processes, strict=True) if process.exitcode]
+    refusals = [text for text, process in zip(texts, processes, strict=True) if process.returncode]
     if not all(PLACE in text or "ours" in text for text in refusals):
         return "unnamed", message
     return ("refused" if refusals else "waited"), message

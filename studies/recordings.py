@@ -5,8 +5,8 @@ Sections of docs/results/recordings.json, each measured in processes of their ow
 - `readers`: M events per CPU second of every reader and of `polarnet inspect`, on 10 M random events, 1 M a second, of
   a 1280 x 720 sensor where the format has no other (10 k events a packet or message). The CPU time is that of the
   process and its children, the shortest of three runs, with the file in the disk cache. Writers: the same from memory.
-- `bytes`: memory of `read_recording` for each event more, between 8 and 32 M events.
-- `memory`: peak of `inspect`, `convert` and `recover --method highpass` on 2 to 128 M events of a 346 x 260 sensor.
+- `memory`: peak of `inspect`, `convert` and `recover --method highpass` on 2 to 128 M events of a 346 x 260 sensor,
+  and bytes of `read_recording` for each event more, between 8 and 32 M events.
 - `cases`: the reference cases, with POLARNET_SHARED: what their table says of each and of polarnet before,
   and what their tests see now.
 """

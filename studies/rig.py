@@ -22,8 +22,8 @@ from polarnet.recordings.recording import open_recording
 from polarnet.recordings.writers import write_hdf5
 from polarnet.reports.recordings import draw_calibration, recording_picture
 from polarnet.simulation.scene import scene_from_rgb
+from studies.pictures import few_colours
 from studies.simulated_rig import RigConfig, write_rig
-from studies.simulation_pictures import few_colours
 from studies.study import PICTURES, ROOT
 
 RIG = RigConfig(

@@ -8,8 +8,6 @@
 - simulation: events of one drifting sensor (`studies.simulation_run`). Times are medians of wall-clock time. Every
   model and number of threads runs in its own process; the processes take turns, so that other load affects all of them
   alike. --write: docs/results/emulation.json.
-- simulation with --before CHECKOUT: processor time of v2e and exact on one thread, of both checkouts in turns.
-  --write: docs/results/speed.json, section simulation_turns.
 - live: `polarnet recover` of a million random events a second on 260 x 346 pixels, with every output and with numbers
   alone. From a store: how many times as fast as real time. `--live`, `--seconds` (60) of lines through a pipe: latency,
   joined windows, and memory in the second and the last third of the time. --write: docs/results/speed.json.
@@ -24,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +39,6 @@ from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
-from studies import simulation_run
 from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
 
 SIZES = ((120, 180), (260, 346), (480, 640))
@@ -54,7 +51,7 @@ WINDOW_US = round(1e6 / 30)
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
 LIVE_SIZE, EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = (260, 346), 1_000_000, 100, 10, 10
-ROUNDS, PAIRS = 3, 12  # processes of each model and number of threads; of each checkout
+ROUNDS = 3  # processes of each checkout, of each model and number of threads
 
 
 def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
@@ -66,7 +63,7 @@ def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, flo
     rates = {}
     for name, size, runs in (("file", recoverer.at_once(height, width), RUNS), ("camera", 1, TIMED_WINDOWS)):
         count = size * (WARM_RUNS + runs)
-        windows = windows_of(random_channels(height, width, count), count)
+        windows = random_windows(height, width, count)
         state = recoverer.start(height, width)
         for number in range(WARM_RUNS + runs):
             if number == WARM_RUNS:
@@ -76,8 +73,8 @@ def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, flo
     return rates
 
 
-def random_channels(height: int, width: int, windows: int) -> list[Events]:
-    """Events of four channels, as long as this number of windows: random points that move to the right."""
+def random_windows(height: int, width: int, windows: int) -> list[EventWindow]:
+    """Windows of four channels, one after the other: random points that move to the right."""
     generator = np.random.default_rng(0)
     count = round(EVENTS_PER_PIXEL * height * width)
     number = np.repeat(np.arange(windows), count)
@@ -88,13 +85,8 @@ def random_channels(height: int, width: int, windows: int) -> list[Events]:
         p = np.tile(generator.choice([-1, 1], count), windows)
         return Events.from_columns(t, (x + SHIFT * number) % width, y, p, height, width)
 
-    return [random_channel() for _ in range(4)]
-
-
-def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
-    """The first windows of the channels, one after the other."""
-    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
-    return list(cutter.add(channels, windows * WINDOW_US))
+    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
+    return list(cutter.add([random_channel() for _ in range(4)], windows * WINDOW_US))
 
 
 def measure_network(threads: int) -> dict[str, Any]:
@@ -109,52 +101,29 @@ def measure_network(threads: int) -> dict[str, Any]:
     return {"threads": threads, "precision": precision_on(CPU, "auto"), "sizes": sizes}
 
 
-def in_turns(before: Path, rounds: int, *script: object) -> dict[Path, list[dict[str, Any]]]:
-    """What a script of this checkout prints as JSON with the packages of `before` and with those of this one, in turns.
+def measure_turns(before: Path, threads: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Medians of windows a second of the checkout `before` and of this one, and their ratios; the latter by size.
 
-    Each checkout goes first in every other round.
+    The network of each runs in processes of its own, in turns; each checkout goes first in every other round.
     """
     turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
-    for number in range(rounds):
+    for number in range(ROUNDS):
         for root in list(turns)[:: (-1) ** number]:
             environment = {**os.environ, "PYTHONPATH": str(root)}
-            command = [sys.executable, *map(str, script)]
+            command = [sys.executable, __file__, "--sizes", str(threads)]
             done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-            turns[root].append(json.loads(done.stdout.splitlines()[-1]))
-    return turns
-
-
-def measure_turns(before: Path, threads: int) -> dict[str, Any]:
-    """Medians of windows a second of the checkout `before` and of this one, which take turns, and their ratios."""
-    turns = in_turns(before, ROUNDS, __file__, "--sizes", threads)
+            turns[root].append(json.loads(done.stdout.splitlines()[-1])["sizes"])
 
     def medians(root: Path, size: str) -> dict[str, float]:
-        return {kind: float(np.median([one["sizes"][size]["pixels"][kind] for one in turns[root]])) for kind in KINDS}
+        return {kind: float(np.median([sizes[size]["pixels"][kind] for sizes in turns[root]])) for kind in KINDS}
 
-    sizes = {}
-    for size in turns[ROOT][0]["sizes"]:
+    figures = {}
+    for size in turns[ROOT][0]:
         old, new = medians(before, size), medians(ROOT, size)
-        sizes[size] = {"before": old, "now": new, "speedup": {kind: round(new[kind] / old[kind], 2) for kind in KINDS}}
-    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": sizes}
-
-
-def measure_simulation_turns(before: Path) -> dict[str, Any]:
-    """Processor time of a run by model on one thread, of the checkout `before` and of this one, and their ratios.
-
-    A ratio is the median of those of the processes that ran one after the other.
-    """
-    figures: dict[str, Any] = {"commit_before": git(before, "rev-parse", "HEAD"), "pairs": PAIRS}
-    for model in MODELS[:2]:
-        turns = in_turns(before, PAIRS, simulation_run.__file__, model, 1)
-        old, new = (np.array([np.median(one["cpu_seconds"]) for one in turns[root]]) for root in (before, ROOT))
-        events = {str(one["events"]) for root in turns for one in turns[root]}
-        figures[model] = {
-            "cpu_seconds_before": round(float(np.median(old)), 4),
-            "cpu_seconds": round(float(np.median(new)), 4),
-            "time_over_before": round(float(np.median(new / old)), 3),
-            "events": "equal in number" if len(events) == 1 else "of other numbers",
-        }
-    return figures
+        speedup = {kind: round(new[kind] / old[kind], 2) for kind in KINDS}
+        figures[size] = {"before": old, "now": new, "speedup": speedup}
+    headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in figures.items()}
+    return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": figures}, headlines
 
 
 def measure_models() -> dict[str, dict[str, Any]]:
@@ -175,8 +144,11 @@ def measure_models() -> dict[str, dict[str, Any]]:
     }
 
 
-def measure_live(seconds: int) -> dict[str, Any]:
-    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs."""
+def measure_live(seconds: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs.
+
+    Headlines are those with every output.
+    """
     generator, size = np.random.default_rng(0), dict(zip(("height", "width"), LIVE_SIZE, strict=True))
     y, x, p, k = (generator.integers(0, limit, EVENTS_PER_S) for limit in (*LIVE_SIZE, 2, 4))
     t = np.arange(EVENTS_PER_S) * 1_000_000 // EVENTS_PER_S
@@ -205,7 +177,8 @@ def measure_live(seconds: int) -> dict[str, Any]:
                 "frames": re.findall(r"(?m)^(?:frames|joined) +(.+)$", facts),
                 "resident_mib": {"second third": max(resident_mib[third:-third]), "last": max(resident_mib[-third:])},
             }
-    return figures
+    factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
+    return figures, {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
 
 
 def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
@@ -250,33 +223,17 @@ def main() -> None:
     if arguments.sizes:
         print(json.dumps(measure_network(int(arguments.sizes))))
         return
-    if arguments.before and arguments.only == "simulation":
-        record, turns = machine_record(), measure_simulation_turns(arguments.before)
-        print(json.dumps(turns, indent=1))
-        if arguments.write:
-            write_section("speed", "simulation_turns", turns, record)
-        return
-    if arguments.before:
-        record, turns = machine_record(), measure_turns(arguments.before, arguments.threads)
-        print(json.dumps(turns, indent=1))
-        if arguments.write:
-            headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in turns["sizes"].items()}
-            write_section("speed", "turns", turns, record, headlines)
-        return
-    studies: dict[str, tuple[str, str, Callable[[], dict[str, Any]]]] = {
-        "network": ("robustness", "speed", lambda: measure_network(arguments.threads)),
-        "simulation": ("emulation", "models", measure_models),
+    studies: dict[str, tuple[str, str, Callable[[], tuple[dict[str, Any], dict[str, Any]]]]] = {
+        "network": ("robustness", "speed", lambda: (measure_network(arguments.threads), {})),
+        "simulation": ("emulation", "models", lambda: (measure_models(), {})),
         "live": ("speed", "live", lambda: measure_live(arguments.seconds)),
     }
+    if arguments.before:
+        studies = {"network": ("speed", "turns", lambda: measure_turns(arguments.before, arguments.threads))}
     for kind, (name, section, measure) in studies.items():
         if arguments.only in (None, kind):
-            record = machine_record()
-            figures = measure()
+            record, (figures, headlines) = machine_record(), measure()
             print(json.dumps(figures, indent=1), flush=True)
-            headlines = {}
-            if kind == "live":
-                factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
-                headlines = {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
             if arguments.write:
                 write_section(name, section, figures, record, headlines)
 

@@ -25,7 +25,7 @@ MEASURED = ("docs/results", "docs/pictures", "dvc.lock", "data/benchmark/metrics
 """Files that measurements write, so that they may differ from the commit that a figure names."""
 
 
-def machine_record(root: Path = ROOT) -> dict[str, Any]:
+def machine_record() -> dict[str, Any]:
     """Machine, versions and commit of a measurement: the keys common to all files in docs/results."""
     return {
         "machine": processor(),
@@ -33,14 +33,14 @@ def machine_record(root: Path = ROOT) -> dict[str, Any]:
         "cores": usable_cores(),
         "load": round(os.getloadavg()[0], 2),
         "versions": {"python": platform.python_version()} | {n: importlib.metadata.version(n) for n in VERSIONS_OF},
-        "commit": git(root, "rev-parse", "HEAD"),
+        "commit": git(ROOT, "rev-parse", "HEAD"),
     }
 
 
-def uncommitted(root: Path) -> str:
-    """Changed files of the project at `root`, except measured ones; empty if a figure may name its commit."""
+def uncommitted() -> str:
+    """Changed files of the project, except measured ones; empty if a figure may name its commit."""
     but_for = [f":!{path}" for path in MEASURED]
-    return git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", *but_for)
+    return git(ROOT, "status", "--porcelain", "--untracked-files=no", "--", ".", *but_for)
 
 
 def command_line(about: str | None, written: str) -> argparse.ArgumentParser:
@@ -53,7 +53,7 @@ def command_line(about: str | None, written: str) -> argparse.ArgumentParser:
 def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """The command's arguments, with absolute paths; `--write` with uncommitted changes ends the program."""
     arguments = parser.parse_args()
-    if arguments.write and (changed := uncommitted(ROOT)):
+    if arguments.write and (changed := uncommitted()):
         parser.error(f"--write: commit first, because the figures name a commit; changed:\n{changed}")
     for name, value in vars(arguments).items():
         if isinstance(value, Path):
@@ -92,9 +92,9 @@ def outcomes(*tests: str) -> dict[str, dict[str, Any]]:
     }
 
 
-def read_results(root: Path, name: str) -> dict[str, Any]:
+def read_results(name: str) -> dict[str, Any]:
     """Content of docs/results/NAME.json; empty if the file does not exist yet."""
-    path = root / "docs" / "results" / f"{name}.json"
+    path = ROOT / "docs" / "results" / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
@@ -104,20 +104,19 @@ def write_section(
     figures: Mapping[str, Any],
     record: Mapping[str, Any],
     headlines: Mapping[str, Any] | None = None,
-    root: Path = ROOT,
 ) -> Path:
     """Write `figures` and the record taken before measuring as a section of docs/results/NAME.json; others stay.
 
     `headlines` are figures above the sections; a mapping is merged into the existing one.
     """
-    path, known = root / "docs" / "results" / f"{name}.json", read_results(root, name)
+    path, known = ROOT / "docs" / "results" / f"{name}.json", read_results(name)
     known["records"] = dict(sorted({**known.get("records", {}), section: dict(record)}.items()))
     known[section] = dict(figures)
     for key, value in (headlines or {}).items():
         known[key] = {**known.get(key, {}), **value} if isinstance(value, Mapping) else value
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(dict(sorted(known.items())), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    print(f"wrote section {section} of {path.relative_to(root)}; `python -m studies.docs` brings it into the pages")
+    print(f"wrote section {section} of {path.relative_to(ROOT)}; `python -m studies.docs` brings it into the pages")
     return path
 
 
