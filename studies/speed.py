@@ -8,9 +8,10 @@
 - simulation: events of one drifting sensor (`studies.simulation_run`). Times are medians of wall-clock time. Every
   model and number of threads runs in its own process; the processes take turns, so that other load affects all of them
   alike. --write: docs/results/emulation.json.
-- live: `polarnet recover` of a million random events a second on 260 x 346 pixels, with every output and with numbers
-  alone. From a store: how many times as fast as real time. `--live`, `--seconds` (60) of lines through a pipe: latency,
-  joined windows, and memory in the second and the last third of the time. --write: docs/results/speed.json.
+- live: `polarnet recover` of a million random events a second, with every output and with numbers alone, on 260 x 346
+  pixels behind each polarizer, and on the 130 x 173 of a PDAVIS. From a store: how many times as fast as real time.
+  `--live`, `--seconds` (60) of lines through a pipe: latency, joined windows, and memory in the second and the last
+  third of the time. --write: docs/results/speed.json.
 """
 
 import argparse
@@ -50,7 +51,8 @@ EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 WINDOW_US = round(1e6 / 30)
 MODELS = ("v2e", "exact", "esim", "dvs_voltmeter")
 THREADS = (1, 2)
-LIVE_SIZE, EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = (260, 346), 1_000_000, 100, 10, 10
+LIVE_SIZES, OUTPUTS = ((260, 346), (130, 173)), {"all": ("zarr", "mp4"), "numbers": ("zarr",)}
+EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = 1_000_000, 100, 10, 10
 ROUNDS = 3  # processes of each checkout, of each model and number of threads
 
 
@@ -145,28 +147,38 @@ def measure_models() -> dict[str, dict[str, Any]]:
 
 
 def measure_live(seconds: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by outputs.
+    """Facts that `polarnet recover` prints about a store and about lines that come in real time, by size and outputs.
 
     Headlines are those with every output.
     """
-    generator, size = np.random.default_rng(0), dict(zip(("height", "width"), LIVE_SIZE, strict=True))
-    y, x, p, k = (generator.integers(0, limit, EVENTS_PER_S) for limit in (*LIVE_SIZE, 2, 4))
+    sizes = {f"{height} x {width}": measure_live_size(seconds, height, width) for height, width in LIVE_SIZES}
+    (height, width), *_ = LIVE_SIZES
+    factors = {f"realtime_factor_{height}x{width}": sizes[f"{height} x {width}"]["all"]["realtime_factor"]}
+    latencies = [of_size["all"]["latency_ms_95"] for of_size in sizes.values()]
+    headlines = factors | {"live_latency_ms_95": latencies[0], "live_latency_ms_95_pdavis": latencies[1]}
+    return {"events_per_s": EVENTS_PER_S, "seconds": seconds, "sizes": sizes}, headlines
+
+
+def measure_live_size(seconds: int, height: int, width: int) -> dict[str, Any]:
+    """The same of one size of the four channels."""
+    generator, figures = np.random.default_rng(0), {}
+    y, x, p, k = (generator.integers(0, limit, EVENTS_PER_S) for limit in (height, width, 2, 4))
     t = np.arange(EVENTS_PER_S) * 1_000_000 // EVENTS_PER_S
     tails = np.array([b" %3d %3d %d %3d\n" % row for row in zip(x, y, p, 45 * k, strict=True)])
-    figures: dict[str, Any] = {**size, "events_per_s": EVENTS_PER_S, "seconds": seconds}
     with tempfile.TemporaryDirectory() as folder:
-        store = EventStore.create(f"{folder}/events.zarr", ["random"], *LIVE_SIZE, {})
-        second = [Events.from_columns(t[k == n], x[k == n], y[k == n], 2 * p[k == n] - 1, **size) for n in range(4)]
+        store = EventStore.create(f"{folder}/events.zarr", ["random"], height, width, {})
+        columns = [(t[k == n], x[k == n], y[k == n], 2 * p[k == n] - 1) for n in range(4)]
+        second = [Events.from_columns(*of_channel, height=height, width=width) for of_channel in columns]
         file = [concatenate([shifted(one, -1_000_000 * n) for n in range(FILE_SECONDS)]) for one in second]
         store.write("random", file, 1_000_000 * FILE_SECONDS)
         store.finish()
-        for name, written in (("all", ["zarr", "png", "mp4"]), ("numbers", ["zarr"])):
+        for name, written in OUTPUTS.items():
             outputs = ["--write", *written, "--out", f"{folder}/{name}"]
             command = [sys.executable, "-m", "polarnet.cli", "recover", "--method", "ours", *outputs]
             of_file = subprocess.run([*command, f"{folder}/events.zarr"], capture_output=True, text=True, check=True)
             with tempfile.TemporaryFile("w+") as printed:
                 live = subprocess.Popen([*command, "--live", "-"], stdin=subprocess.PIPE, stdout=printed)
-                resident_mib = feed(live, tails, seconds)
+                resident_mib = feed(live, (height, width), tails, seconds)
                 printed.seek(0)
                 facts = printed.read()
             third = len(resident_mib) // 3
@@ -177,11 +189,10 @@ def measure_live(seconds: int) -> tuple[dict[str, Any], dict[str, Any]]:
                 "frames": re.findall(r"(?m)^(?:frames|joined) +(.+)$", facts),
                 "resident_mib": {"second third": max(resident_mib[third:-third]), "last": max(resident_mib[-third:])},
             }
-    factor, latency_ms = (figures["all"][key] for key in ("realtime_factor", "latency_ms_95"))
-    return figures, {"realtime_factor_260x346": factor, "live_latency_ms_95": latency_ms}
+    return figures
 
 
-def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
+def feed(live: subprocess.Popen, size: tuple[int, int], tails: np.ndarray, seconds: int) -> list[int]:
     """Write lines, a time and a tail each, in real time; returns the process's resident MiB at each second.
 
     They begin when the process uses no processor time for a second: it has started and waits for events.
@@ -189,7 +200,7 @@ def feed(live: subprocess.Popen, tails: np.ndarray, seconds: int) -> list[int]:
     assert live.stdin is not None
     resident_mib, number = [], len(tails) // CHUNKS_PER_S
     digits = 10 ** np.arange(LIVE_DIGITS)[::-1]
-    live.stdin.write(b"%d %d\n" % LIVE_SIZE[::-1])
+    live.stdin.write(b"%d %d\n" % size[::-1])
     live.stdin.flush()
     before, used = ["not yet"], ["started"]
     while used != before:
