@@ -15,8 +15,7 @@ from skimage import data
 from polarnet.captures.dot import EVENT_CAPTURES, read_event_capture
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import load
-from polarnet.events.stream import slice_time
-from polarnet.recordings.arrangements import shifted
+from polarnet.events.stream import shifted, slice_time
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.writers import write_hdf5

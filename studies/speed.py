@@ -32,12 +32,11 @@ import numpy as np
 import torch
 
 from polarnet.config.tree import load
-from polarnet.events.stream import Events, concatenate
+from polarnet.events.stream import Events, concatenate, shifted
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore

@@ -29,8 +29,7 @@ from polarnet.captures.dot import (
     read_intensity_capture,
     region_negative_times_us,
 )
-from polarnet.events.stream import Events, crop, downscale, slice_time
-from polarnet.recordings.arrangements import shifted
+from polarnet.events.stream import Events, crop, downscale, shifted, slice_time
 from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore

@@ -7,11 +7,10 @@ from pathlib import Path
 from polarnet.cli.options import READING, duration_us, reading_of, refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.stores import is_store
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events, shifted, slice_time
 from polarnet.networks.onnx_export import TOLERANCE, export_network
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.recording import RecordingReader, open_recording
 from polarnet.recordings.repair import MAX_TIME
 from polarnet.recordings.source import RecordingError

@@ -121,6 +121,11 @@ def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m
     return Events(t, x, y, p, events.height, events.width)
 
 
+def shifted(events: Events, origin_us: int) -> Events:
+    """The same events, with `origin_us` as time 0."""
+    return replace(events, t=events.t - origin_us)
+
+
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
     """Events in a part of the sensor, in coordinates from the part's corner; ValueError if it exceeds the sensor."""
     if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):

@@ -11,11 +11,10 @@ from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events, merge
+from polarnet.events.stream import Events, merge, shifted
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
-from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.noise import Cleaning
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
