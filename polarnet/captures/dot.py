@@ -48,8 +48,6 @@ class RecordingsConfig:
     """Size of the central crop."""
     size: list[Annotated[int, Field(ge=2, le=1280)]]
     """Size to which the crop is reduced."""
-    keep_event_rate: bool
-    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
     picture_rate_hz: PositiveFloat | None
     """Rate of the pictures in intensity captures whose files have no times."""
     hot_pixel_factor: Annotated[float, Field(gt=1)] | None

@@ -164,7 +164,7 @@ def aligned(
 ) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
     """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
 
-    The events are those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
+    The events are those of the crop from the common start on, reduced by `downscale`.
     The intensities come from the reduced pictures before and after each frame's time, interpolated.
     """
     t_us = frame_times_us(calibrated.duration_us, config)
@@ -173,7 +173,7 @@ def aligned(
         events, start = target.events[capture], calibrated.start_us[capture]
         during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
-        channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
+        channels.append(downscale(part, config.size[0], config.size[1]))
     planes = []
     for name in INTENSITY_CAPTURES:
         frames = over_time(target.intensities[name], calibrated.start_us[name], config)(t_us)
