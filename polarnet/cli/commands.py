@@ -408,4 +408,3 @@ def _reading(command: Command) -> None:
     )
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
     command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
-    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")

@@ -8,7 +8,7 @@ from typing import Any
 from polarnet.events.streaming import parse_window
 from polarnet.recordings.noise import FOUND, HOT_FACTOR, Cleaning
 
-READING = ("format", "height", "width", "clock_mhz")
+READING = ("format", "height", "width")
 """Options that describe a camera's file where the file itself does not."""
 CLEANING = ("hot_pixels", "background")
 

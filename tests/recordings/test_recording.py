@@ -92,17 +92,13 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
     for arguments, message in (
         ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
         ({"chunk_events": 0}, "at least one event"),
-        ({"clock_mhz": 0.0}, r"a clock of 0\.001 to 10000 MHz"),
         ({}, "give --height and --width"),
     ):
         with pytest.raises(ValueError, match=message):
             open_recording(tmp_path / "e.txt", **arguments)
     (tmp_path / "e.txt").write_text("18 12\n5 1 2 1\n")
-    for name, value in (("part", "left"), ("clock_mhz", 50)):
-        with pytest.raises(
-            RecordingError, match=rf"e\.txt: expected no {name}, which has no meaning for the format text"
-        ):
-            open_recording(tmp_path / "e.txt", **{name: value})
+    with pytest.raises(RecordingError, match=r"e\.txt: expected no part, which has no meaning for the format text"):
+        open_recording(tmp_path / "e.txt", part="left")
     (tmp_path / "e.bag").write_bytes(gzip.compress(b"#ROSBAG V2.0\n"))
     with pytest.raises(RecordingError, match=r"e\.bag: expected the format rosbag outside an archive; unpack it"):
         open_recording(tmp_path / "e.bag")

@@ -144,7 +144,7 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors: there is no such file"),
     (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
-    (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
+    (("--live", "--method", "cf", "--height", 70), "--live: expected no --height"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
     (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
@@ -27,7 +27,7 @@ from polarnet.runtime.compilation import compiled
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
 
-CLOCK_MHZ = 100.0  # the vendor's default
+CLOCK_MHZ = 100  # the vendor's default
 TICK_CYCLES = 1024  # clock cycles per step of the time stamp
 
 HEADER = struct.Struct("<8B I")
@@ -89,7 +89,6 @@ def open_bin(path: Path, choices: Choices) -> Source:
             f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
             f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
         )
-    clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
     def blocks(counts: Counts) -> Iterator[Block]:
         state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
@@ -104,14 +103,14 @@ def open_bin(path: Path, choices: Choices) -> Source:
                 events, orphans, unchanged = _decode(package[:-1], state, last_adc, columns)
                 counts.update({"orphans": orphans, "no_change": unchanged})
                 t, x, y, p = (column[:events] for column in columns)
-                yield Block(microseconds(t, clock_mhz), x, y, p)
+                yield Block(microseconds(t), x, y, p)
 
     return Source(HEIGHT, WIDTH, blocks)
 
 
-def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
+def microseconds(ticks: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
-    return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
+    return ticks * TICK_CYCLES // CLOCK_MHZ
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
@@ -136,11 +135,7 @@ def matches_csv(path: Path, head: bytes) -> bool:
 
 
 def open_csv(path: Path, choices: Choices) -> Source:
-    """Open a CSV file of Event Intensity mode; the other two modes have no polarity and are refused.
-
-    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
-    selects this interpretation.
-    """
+    """Open a CSV file of Event Intensity mode, whose times are microseconds; other modes have no polarity: refused."""
     lines = numbers_of(start_of(path, HEAD_BYTES))
     if lines and len(lines[0].words) != CSV_COLUMNS:
         raise RecordingError(
@@ -153,7 +148,7 @@ def open_csv(path: Path, choices: Choices) -> Source:
             changed = rows[:, 3] != 0
             row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
             counts["no_change"] += len(rows) - len(t)
-            yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
+            yield Block(t, column, row, p)
 
     return Source(HEIGHT, WIDTH, blocks)
 
