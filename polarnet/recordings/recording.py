@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from polarnet.events.stream import MAX_SIDE, Events
+from polarnet.events.stream import Events
 from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import (
@@ -97,25 +97,24 @@ class Recording:
 
 
 class RecordingReader:
-    """Yields a file's events in chunks of `chunk_events` (the last may be shorter); made by `open_recording`.
+    """Yields a file's events in chunks, of which the last may be shorter; made by `open_recording`.
 
     Iterating reads the file from its start in constant memory, and raises RecordingError where the file turns out to be
     damaged. `repairs` counts the repairs up to the latest chunk.
     """
 
-    def __init__(self, path: Path, form: str, blocks: Blocks, sensor: tuple[int, int], chunk_events: int):
+    def __init__(self, path: Path, form: str, blocks: Blocks, sensor: tuple[int, int]):
         self.path = path
         self.format = form
         self.height, self.width = sensor
         self.repairs = Counts()
         self._blocks = blocks
-        self._chunk_events = chunk_events
 
     def __iter__(self) -> Iterator[Events]:
-        return self.chunks(self._chunk_events)
+        return self.chunks()
 
     def chunks(self, size: int = CHUNK_EVENTS, bridged_us: int = 0) -> Iterator[Events]:
-        """Iterate with another number of events in a chunk.
+        """Iterate with `size` events in a chunk.
 
         A clock that was set anew in the first `bridged_us` is no error: events go on 10 ms after the newest one.
         """
@@ -134,7 +133,6 @@ def open_recording(
     height: int | None = None,
     width: int | None = None,
     part: str | None = None,
-    chunk_events: int = CHUNK_EVENTS,
 ) -> RecordingReader:
     """Open a file to read it chunk by chunk.
 
@@ -146,11 +144,6 @@ def open_recording(
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    for name, side in (("height", height), ("width", width)):
-        if side is not None and not 0 < side <= MAX_SIDE:
-            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
-    if chunk_events < 1:
-        raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
     choices = Choices(height, width, part)
     form = detect_format(path) if format is None else format
     if form not in FORMATS:
@@ -161,7 +154,7 @@ def open_recording(
         raise RecordingError(f"{path.name}: expected the format {form} outside an archive; unpack it")
     source = FORMATS[form].open(path, choices)
     sensor = sensor_size(path, choices, source.height, source.width)
-    return RecordingReader(path, form, source.blocks, sensor, chunk_events)
+    return RecordingReader(path, form, source.blocks, sensor)
 
 
 def read_recording(

@@ -27,7 +27,7 @@ def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_se
     later = [(100_000 + 1000 * k, k % 20, 3, 1) for k in range(30)]
     path = tmp_path / "e.txt"
     path.write_text("20 10\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in slow + quick + later))
-    inspection = inspect_recording(open_recording(path, chunk_events=7), FACTOR)
+    inspection = inspect_recording(open_recording(path), FACTOR)
     assert columns(inspection.busiest) == [[t for t, *_ in quick], [5] * 30, [7] * 30, [-1] * 30]
     assert "busiest     30 events in 2.9 ms from 50,000 us, 10.34 kev/s" in [*findings(inspection)]
     (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")

@@ -41,13 +41,13 @@ def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
     assert (recording.format, len(recording.events), recording.repairs) == ("dat", 2009, {})
 
 
-@pytest.mark.parametrize("chunk_events", [1, 7, 999, 1000, 10**6])
-def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, chunk_events):
+@pytest.mark.parametrize("size", [1, 7, 999, 1000, 10**6])
+def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, size):
     events = make_random_events(0, 1000, 10**6)
     write_celex5_csv(tmp_path / "e.csv", events)
-    chunks = list(open_recording(tmp_path / "e.csv", chunk_events=chunk_events))
-    assert {len(chunk) for chunk in chunks[:-1]} <= {chunk_events}
-    assert 0 < len(chunks[-1]) <= chunk_events
+    chunks = list(open_recording(tmp_path / "e.csv").chunks(size))
+    assert {len(chunk) for chunk in chunks[:-1]} <= {size}
+    assert 0 < len(chunks[-1]) <= size
     for name in "txyp":
         assert torch.equal(torch.cat([getattr(chunk, name) for chunk in chunks]), getattr(events, name))
 
@@ -90,8 +90,7 @@ def test_impossible_arguments_are_refused_before_reading(tmp_path):
         open_recording(tmp_path / "nothing.csv")
     (tmp_path / "e.txt").write_text("5 1 2 1\n")
     for arguments, message in (
-        ({"height": 0, "width": 4}, "expected a height of 1 to 32767 px, got 0"),
-        ({"chunk_events": 0}, "at least one event"),
+        ({"height": 0, "width": 4}, "expected a sensor with sides of 1 to 32767 px, got 0x4"),
         ({}, "give --height and --width"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -117,8 +116,8 @@ def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, 
     if name.endswith(".gz"):
         path = path.rename(tmp_path / "plain")
         (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
-    reader = open_recording(tmp_path / name, chunk_events=10)
-    shares = [reader.repairs.share_read for _ in reader]
+    reader = open_recording(tmp_path / name)
+    shares = [reader.repairs.share_read for _ in reader.chunks(10)]
     assert shares == sorted(shares)
     assert 0 < shares[0] < 0.5 or name.endswith(".gz")
     assert 0.8 < shares[-1] <= 1
