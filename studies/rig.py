@@ -56,8 +56,7 @@ def main() -> None:
         start_us, capture = found.start_us[first], scratch / "events_0.h5"
         common = shifted(slice_time(events, start_us, start_us + found.duration_us), start_us)
         write_hdf5(capture, common, found.duration_us)
-        assert recordings.hot_pixel_factor is not None
-        inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
+        inspection = inspect_recording(open_recording(capture))
     (PICTURES / "recordings_inspect.png").write_bytes(recording_picture(inspection))
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
     (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"text": "\n".join(lines)}, indent=2) + "\n")

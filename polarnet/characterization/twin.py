@@ -12,7 +12,7 @@ from polarnet.characterization.fit import SensorFit
 from polarnet.characterization.flicker import Flicker
 from polarnet.characterization.intervals import by_pixel, intervals_of
 from polarnet.events.stream import Events, concatenate, crop, slice_time
-from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.runtime.machine import seed_for
 from polarnet.simulation.emulator import EmulatorConfig, SensorState, emulate
 from polarnet.terminal.progress import ProgressBar
@@ -73,7 +73,7 @@ def compare(recording: Events, light: Flicker | float, sensor: EmulatorConfig, s
     part = crop(slice_time(recording, start_us, stop_us), top, left, height, width)
     frames, t_us = frames_of(light, start_us, stop_us, height, width)
     twin = emulated(frames, t_us, replace(sensor, hot_pixel_share=0.0), seed_for(seed, "twin", "sensor"))
-    hot = hot_pixels(event_counts(part), (stop_us - start_us) * 1e-6, HOT_FACTOR)
+    hot = hot_pixels(event_counts(part), (stop_us - start_us) * 1e-6)
     pair = [without_pixels(part, hot), without_pixels(twin, hot)]
     ratios = [float((events.p > 0).sum()) / max(int((events.p < 0).sum()), 1) for events in pair]
     return Comparison(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from polarnet.events.streaming import parse_window
-from polarnet.recordings.noise import FOUND, HOT_FACTOR, Cleaning
+from polarnet.recordings.noise import FOUND, Cleaning
 
 READING = ("format", "height", "width")
 """Options that describe a camera's file where the file itself does not."""
@@ -25,7 +25,7 @@ def cleaning_of(options: argparse.Namespace) -> Cleaning:
         hot = str(Path(hot).resolve())
         if not Path(hot).is_file():
             raise FileNotFoundError(f"--hot-pixels {options.hot_pixels}: expected {FOUND} or a file, there is none")
-    return Cleaning(hot, HOT_FACTOR, duration_us(options, "background", "10ms"))
+    return Cleaning(hot, duration_us(options, "background", "10ms"))
 
 
 def duration_us(options: argparse.Namespace, name: str, example: str) -> int | None:

@@ -46,11 +46,8 @@ class Inspection:
         return int(self.counts.sum())
 
 
-def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
-    """Read a recording once, in memory that does not grow with it.
-
-    `hot_pixel_factor` is the `factor` of `polarnet.recordings.noise.hot_pixels`. RecordingError if reading fails.
-    """
+def inspect_recording(reader: RecordingReader) -> Inspection:
+    """Read a recording once, in memory that does not grow with it; RecordingError if reading fails."""
     shape = reader.height, reader.width
     one = Inspection(reader.format, np.zeros(shape, np.int64), np.zeros(shape, np.bool_), Events.empty(*shape))
     size, least = max(1, round(EVENTS_PER_PIXEL * one.counts.size)), (True, np.inf)
@@ -72,7 +69,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         for picture in celex5_pictures(reader.path):
             one.first_picture = picture.intensity if one.pictures == 0 else one.first_picture
             one.pictures += 1
-    one.hot = hot_pixels(one.counts, (one.stop_us - one.start_us) * 1e-6, hot_pixel_factor)
+    one.hot = hot_pixels(one.counts, (one.stop_us - one.start_us) * 1e-6)
     one.repairs = {kind: count for kind, count in reader.repairs.items() if count}
     return one
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64
 from polarnet.events.stream import slice_time
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.recordings.arrangements import Piece
-from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
 WINDOW_US = 33_333
@@ -59,7 +59,7 @@ class ChannelCheck:
         """Problems found, a sentence each; empty if there are none, or too few events to judge."""
         seconds = len(self._windows) * WINDOW_US * 1e-6
         counts = np.sum([[event_counts(e) for e in window.channels] for window in self._windows] or [[]], axis=0)
-        hot = [hot_pixels(count, seconds, HOT_FACTOR) for count in counts]
+        hot = [hot_pixels(count, seconds) for count in counts]
         findings = _channel_findings(*pair_misfits(self._windows, hot), self.counts, self._mosaic)
         if disturbing := sum(
             int((bad & (n > DISTURBING_HZ * seconds)).sum()) for n, bad in zip(counts, hot, strict=True)
