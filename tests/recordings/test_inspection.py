@@ -15,7 +15,7 @@ from polarnet.recordings.noise import Cleaner, Cleaning, hot_pixels, never, read
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
-from studies.celex5_writer import write_celex5_csv, write_celex5_pictures
+from studies.celex5_writer import write_celex5_csv
 
 
 def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_sensor(tmp_path, columns):
@@ -67,15 +67,6 @@ def test_inspect_prints_findings_and_draws_no_hot_pixels(tmp_path, make_events, 
     assert picture.shape == (800, 1280, 3)
     coloured = np.argwhere((picture != 255).any(axis=-1))
     assert np.unique(coloured[:, 0]).tolist() == [20]
-
-
-def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
-    picture = np.zeros((800, 1280), np.uint16)
-    picture[:, 640:] = 4095
-    write_celex5_pictures(tmp_path / "p.bin", [picture, np.zeros_like(picture)], [0, 33_000])
-    assert main(["inspect", str(tmp_path / "p.bin"), "--out", str(tmp_path / "out")]) == 0
-    assert "pictures    2" in capsys.readouterr().out
-    assert cv2.imread(str(tmp_path / "out" / "p.bin.png"))[400, [10, 1000], 0].tolist() == [0, 255]
 
 
 def test_one_factor_more_than_the_third_busiest_around_is_hot_and_thin_lines_are_not():
