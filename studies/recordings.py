@@ -112,8 +112,8 @@ def speed_of_writer(form: str) -> float:
     suffix, write = FORMS[form]
     events = concatenate(list(parts(COUNT, *SENSOR)))
     with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder, f"small{suffix}"), parts(SMALL, *SENSOR), None)
-        return round(COUNT / shortest_cpu_s(lambda: write(Path(folder, f"large{suffix}"), events, None)) / 1e6, 2)
+        write(Path(folder, f"small{suffix}"), parts(SMALL, *SENSOR))
+        return round(COUNT / shortest_cpu_s(lambda: write(Path(folder, f"large{suffix}"), events)) / 1e6, 2)
 
 
 def peak_mib() -> float:
@@ -162,7 +162,7 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
         for size in MEMORY_SIZES:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, f"recording{suffix}")
-                write(path, parts(size, *MEMORY_SENSOR), None)
+                write(path, parts(size, *MEMORY_SENSOR))
                 peaks[size] = {name: measured(name, str(path)) for name in (*COMMANDS, "array")}
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}

@@ -55,7 +55,7 @@ def main() -> None:
         events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)
         start_us, capture = found.start_us[first], scratch / "events_0.h5"
         common = shifted(slice_time(events, start_us, start_us + found.duration_us), start_us)
-        write_hdf5(capture, common, found.duration_us)
+        write_hdf5(capture, common)
         inspection = inspect_recording(open_recording(capture))
     (PICTURES / "recordings_inspect.png").write_bytes(recording_picture(inspection))
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]

@@ -51,7 +51,7 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     reader = open_recording(file, **reading_of(options))
     span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
-        FORMS[form][1](temporary, span.chunks(reader), None)
+        FORMS[form][1](temporary, span.chunks(reader))
         if start_us and not span.count:
             raise ValueError(f"{file.name}: expected events between --start and --stop, there are none; leave them out")
     print(f"{file} ({reader.format}) -> {options.out} ({form}): {span.count:,} events, time 0 is {span.origin_us} us")

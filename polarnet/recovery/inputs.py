@@ -23,7 +23,6 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
-from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
@@ -192,8 +191,7 @@ def _stored(store: EventStore, sequence: str) -> Channels:
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
     """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
-    if (folder / EXPORT_INDEX).is_file():
-        names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if names := sorted({path.parent.name for path in folder.glob(f"*/polarizer_{POLARIZER_ANGLES_DEG[0]:03d}.*")}):
         folder = folder / _named(sequence, names, folder.name)
     files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
     if not all(files.values()):

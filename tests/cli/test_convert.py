@@ -15,7 +15,7 @@ EVENTS = [(1_000_000, 3, 4, 1), (1_250_000, 5, 6, -1), (1_500_000, 0, 0, 1), (1_
 
 @pytest.fixture
 def recording(tmp_path):
-    write_text(tmp_path / "in.txt", events_of(EVENTS, 8, 9), 2_000_000)
+    write_text(tmp_path / "in.txt", events_of(EVENTS, 8, 9))
     return tmp_path / "in.txt"
 
 

@@ -112,7 +112,7 @@ def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, 
     monkeypatch.setattr(hdf5, "BLOCK_EVENTS", 100)
     write = {".txt": write_text, ".raw": write_evt3, ".h5": write_hdf5}
     path = tmp_path / name.removesuffix(".gz")
-    write[path.suffix](path, make_random_events(1, 1000, 10**6, 40, 50), 10**6)
+    write[path.suffix](path, make_random_events(1, 1000, 10**6, 40, 50))
     if name.endswith(".gz"):
         path = path.rename(tmp_path / "plain")
         (tmp_path / name).write_bytes(gzip.compress(path.read_bytes()))
