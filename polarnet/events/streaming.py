@@ -58,7 +58,7 @@ class WindowRule:
     events: int | None
     """Number of events in the four channels together."""
     step_us: int | None
-    """Time from one window's end to the next; None: each window begins at the end of the previous window."""
+    """Time between the ends of windows of a time; None: each window begins at the end of the previous window."""
 
     def __post_init__(self):
         if (self.length_us is None) == (self.events is None):
@@ -68,9 +68,11 @@ class WindowRule:
         if self.events is not None and self.events < 2:
             raise ValueError(f"expected windows of at least 2 events, got {self.events}")
         if self.step_us is not None:
+            if self.length_us is None:
+                raise ValueError(f"expected a step with windows of a time alone, got windows of {self.events} events")
             if self.step_us < SHORTEST_STEP_US:
                 raise ValueError(f"expected a step of at least {SHORTEST_STEP_US / 1000} ms, got {self.step_us} us")
-            if self.length_us is not None and self.step_us > self.length_us:
+            if self.step_us > self.length_us:
                 expected = f"a step no longer than the windows of {self.length_us} us"
                 raise ValueError(f"expected {expected}, got {self.step_us} us: events between windows would be lost")
 
@@ -88,15 +90,13 @@ class WindowCutter:
     """Cuts a stream that arrives in pieces into windows, each as soon as all of its events are known.
 
     Windows by time end after one whole length, and then every step (or length). Windows by number end with their last
-    event and start at the previous window's end; with a step, each holds the last `events` events before a multiple of
-    the step, and starts with the first of them. Times count from 0.
+    event and start at the previous window's end. Times count from 0.
     """
 
     def __init__(self, rule: WindowRule, height: int, width: int, channels: int = 4):
         self.rule = rule
         self._held = [Events.empty(height, width)] * channels
-        self._step_us = rule.step_us or rule.length_us
-        self._next_us = rule.length_us or rule.step_us or 0
+        self._next_us = rule.length_us or 0
         self._start_us = 0
         self._until_us = 0
 
@@ -110,8 +110,8 @@ class WindowCutter:
             raise ValueError(f"expected the events of {len(self._held)} channels, got {len(channels)} channels")
         self._check_pauses(channels, until_us)
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
-        if self._step_us is not None:
-            return self._at_steps(self._step_us, until_us)
+        if self.rule.length_us is not None:
+            return self._by_time(self.rule.length_us, until_us)
         assert self.rule.events is not None
         return self._by_number(self.rule.events, until_us)
 
@@ -128,21 +128,12 @@ class WindowCutter:
                 f"{start_us} and {stop_us} us: a damaged time stamp? cut the recording there"
             )
 
-    def _at_steps(self, step_us: int, until_us: int) -> Iterator[EventWindow]:
+    def _by_time(self, length_us: int, until_us: int) -> Iterator[EventWindow]:
         while self._next_us <= until_us:
-            start_us = self._start_of_window(self._next_us)
-            if start_us is not None:
-                self._forget(self._places(start_us))
-                yield self._window(start_us, self._next_us, self._places(self._next_us))
-            self._next_us += step_us
-
-    def _start_of_window(self, stop_us: int) -> int | None:
-        """Start of the window that ends at `stop_us`; None if too few events came before."""
-        if self.rule.events is None:
-            return stop_us - (self.rule.length_us or 0)
-        times = torch.cat([held.t[:n] for held, n in zip(self._held, self._places(stop_us), strict=True)])
-        surplus = len(times) - self.rule.events
-        return int(times.kthvalue(surplus + 1).values) if surplus >= 0 else None
+            start_us = self._next_us - length_us
+            self._forget(self._places(start_us))
+            yield self._window(start_us, self._next_us, self._places(self._next_us))
+            self._next_us += self.rule.step_us or length_us
 
     def _by_number(self, count: int, until_us: int) -> Iterator[EventWindow]:
         known = self._places(until_us)
