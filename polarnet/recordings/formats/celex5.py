@@ -67,27 +67,19 @@ def matches_bin(path: Path, head: bytes) -> bool:
 
 
 def open_bin(path: Path, choices: Choices) -> Source:
-    """Open the events of a BIN file of event format 1; format 2 and some modes have no polarity and are refused.
+    """Open the events of a BIN file of event format 1 in Event Intensity mode; RecordingError for other modes.
 
     A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
     Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
     header = _opened(path)
-    if header.event_format == 0:
+    looped = header.data_type & LOOP
+    if header.event_format != 1 or looped or header.loop_a < INTENSITY:
+        mode = dict(enumerate(MODES)).get(header.loop_a, "unknown")
         raise RecordingError(
-            f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
-            f"event format 1"
-        )
-    if header.data_type & LOOP:
-        raise RecordingError(
-            f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
-            f"record events and pictures each in a mode of their own"
-        )
-    if header.event_format == 2 or header.loop_a < INTENSITY:
-        mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
-        raise RecordingError(
-            f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
-            f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
+            f"{path.name}: expected Event Intensity mode, event format 1, got {'a loop from ' if looped else ''}mode "
+            f"{mode}, event format {header.event_format}; other modes and format 2 have no polarity, format 0 has wrong "
+            f"intensities, and in a loop times stand still during pictures: record again"
         )
 
     def blocks(counts: Counts) -> Iterator[Block]:

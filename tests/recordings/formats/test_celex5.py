@@ -92,10 +92,10 @@ def test_imu_samples_after_a_package_are_passed_over(tmp_path, make_events, read
     ("content", "message"),
     [
         (header()[:8], "expected the 12 bytes of a BIN header of a CeleX-5"),
-        (header(event_format=0) + package(bytes(7)), "events are of format 0, whose intensities are wrong"),
-        (header(data_type=1) + package(bytes(7)), "recorded in loop mode"),
-        (header(loop_a=1) + package(bytes(7)), "Event In-Pixel Timestamp, event format 1, have no polarity"),
-        (header(loop_a=0, event_format=2) + package(bytes(7)), "Event Off-Pixel Timestamp, event format 2, have no"),
+        (header(event_format=0) + package(bytes(7)), "got mode Event Intensity, event format 0; .*wrong intensities"),
+        (header(data_type=1) + package(bytes(7)), "got a loop from mode Event Intensity, .*times stand still"),
+        (header(loop_a=1) + package(bytes(7)), "Event In-Pixel Timestamp, event format 1; other modes .* no"),
+        (header(loop_a=0, event_format=2) + package(bytes(7)), "Event Off-Pixel Timestamp, event format 2"),
         (header() + struct.pack("<I", 2**31) + bytes(70), "package 0 before byte 16 states a length of 2147483648"),
         (header() + package(bytes(70))[:40], "no event can be read in it: {'cut_tail': 1}"),
         (
