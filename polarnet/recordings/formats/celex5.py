@@ -78,8 +78,8 @@ def open_bin(path: Path, choices: Choices) -> Source:
         mode = dict(enumerate(MODES)).get(header.loop_a, "unknown")
         raise RecordingError(
             f"{path.name}: expected Event Intensity mode, event format 1, got {'a loop from ' if looped else ''}mode "
-            f"{mode}, event format {header.event_format}; other modes and format 2 have no polarity, format 0 has wrong "
-            f"intensities, and in a loop times stand still during pictures: record again"
+            f"{mode}, event format {header.event_format}; other modes and format 2 have no polarity, format 0 has "
+            f"wrong intensities, and in a loop times stand still during pictures: record again"
         )
 
     def blocks(counts: Counts) -> Iterator[Block]:
