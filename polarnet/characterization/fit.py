@@ -48,6 +48,10 @@ class SensorFit:
         else:
             self.estimates[name] = estimate
 
+    def parameters(self) -> dict[str, float]:
+        """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones."""
+        return {name: float(f"{one.value:.4g}") for name, one in self.estimates.items()}
+
 
 def fit_sensor(
     static: Events | None, static_light: float, flickers: Sequence[FlickerRecording], pixel: PixelConfig

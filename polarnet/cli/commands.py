@@ -331,8 +331,8 @@ def _fit_sensor(command: AddCommand) -> None:
         "fit the simulated sensor to a camera's recordings",
         "fit-sensor --name lab --static wall.raw --flicker f2.raw f60.raw --frequency 2 60 --contrast 0.8",
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
-        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and says how alike each "
-        "recording and its simulated twin are. docs/fit-sensor.md says what to record.",
+        "pixels of a camera from its recordings; prints a table and writes conf/sensor/NAME.yaml. docs/fit-sensor.md "
+        "says what to record.",
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
