@@ -57,9 +57,7 @@ class RecordingsConfig:
     refine_within_ms: PositiveFloat
     """Search range of the refined start times around the landmark's."""
     frame_rate_hz: PositiveFloat
-    """Frame rate of the sequence's ground truth."""
-    duration_s: PositiveFloat | None
-    """Length of the sequence, from the landmark on; null: as long as all captures last."""
+    """Frame rate of the sequence's ground truth, which lasts as long as all captures do from the landmark on."""
 
     def __post_init__(self):
         for inner, outer in (("sensor", "sensor"), ("region", "sensor"), ("crop", "sensor"), ("size", "crop")):

@@ -137,11 +137,11 @@ def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrat
     used = starts if alignment is None else alignment.start_us
     ends = [int(clean[capture].t[-1]) - used[capture] if len(clean[capture]) else 0 for capture in EVENT_CAPTURES]
     ends += [int(target.intensities[capture].t_us[-1]) - used[capture] for capture in INTENSITY_CAPTURES]
-    duration_us = min(ends) if config.duration_s is None else round(config.duration_s * 1e6)
-    if duration_us > min(ends) or len(frame_times_us(max(duration_us, 0), config)) < 2:
+    duration_us = min(ends)
+    if len(frame_times_us(max(duration_us, 0), config)) < 2:
         raise RecordingError(
-            f"target {target.name}: after their starts the captures have {min(ends) * 1e-6:.3f} s in common; expected "
-            f"at least {config.duration_s or 1 / config.frame_rate_hz:.3f} s. Is a start wrong? Used: {dict(used)} us"
+            f"target {target.name}: after their starts the captures have {duration_us * 1e-6:.3f} s in common; "
+            f"expected at least {1 / config.frame_rate_hz:.3f} s. Is a start wrong? Used: {dict(used)} us"
         )
     late = [c for c in INTENSITY_CAPTURES if target.intensities[c].t_us[0] > used[c]]
     if late:
