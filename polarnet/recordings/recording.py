@@ -57,8 +57,8 @@ FORMATS = {
     **{
         name: Format(
             f"HDF5 of {layout.owner}",
-            hdf5.matcher(name),
-            hdf5.opener(name),
+            partial(hdf5.matches, layout),
+            partial(hdf5.open_hdf5, layout),
             hdf5.e2p_frames if name == "e2p" else None,
             parts=len(layout.parts) > 1,
         )
