@@ -127,7 +127,7 @@ def matches_csv(path: Path, head: bytes) -> bool:
 
 
 def open_csv(path: Path, choices: Choices) -> Source:
-    """Open a CSV file of Event Intensity mode, whose times are microseconds; other modes have no polarity: refused."""
+    """Open a CSV file of Event Intensity mode (times in us); RecordingError for other modes, without polarity."""
     lines = numbers_of(start_of(path, HEAD_BYTES))
     if lines and len(lines[0].words) != CSV_COLUMNS:
         raise RecordingError(
