@@ -17,8 +17,9 @@ from polarnet.characterization.flicker import (
     source_of,
     thresholds_without_leak,
 )
-from polarnet.characterization.intervals import GROUPS, Estimate, by_pixel, chosen_pixels, intervals_of, piled_up_us
+from polarnet.characterization.intervals import GROUPS, Estimate, piled_up_us
 from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
+from polarnet.events.intervals import by_pixel, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.terminal.progress import ProgressBar

@@ -147,8 +147,8 @@ def test_sizes_that_do_not_fit_into_each_other_are_refused(config, wrong, messag
 def test_each_step_lies_between_two_events_of_one_pixel(make_events):
     rows = [(1, 0, 0, 1), (2, 1, 0, -1), (5, 0, 0, 1), (9, 1, 0, 1), (9, 0, 0, -1)]
     pairs = steps(make_events(rows, 1, 2), (0, 0), (1, 2), 0, 9)
-    assert pairs.before_us.tolist() == [1]  # those that end at 9 us are not before the stop
-    assert (pairs.after_us.tolist(), pairs.pixel.tolist(), pairs.polarity.tolist()) == ([5], [0], [1])
+    assert pairs.start_us.tolist() == [1]  # those that end at 9 us are not before the stop
+    assert (pairs.stop_us.tolist(), pairs.pixel.tolist(), pairs.polarity.tolist()) == ([5], [0], [1])
 
 
 def test_without_change_there_is_no_agreement_and_dark_pixels_do_not_count(make_random_events):

@@ -15,7 +15,7 @@ from polarnet.characterization.flicker import (
     pixel_thresholds,
     thresholds_without_leak,
 )
-from polarnet.characterization.intervals import PixelEvents, by_pixel, intervals_of, undisturbed
+from polarnet.characterization.intervals import undisturbed
 from polarnet.characterization.noise import (
     estimate_noise,
     hot_under_constant_light,
@@ -24,6 +24,7 @@ from polarnet.characterization.noise import (
     nominal_shot_noise_hz,
     rate_swing,
 )
+from polarnet.events.intervals import PixelEvents, by_pixel, intervals_of
 from polarnet.simulation.presets import SENSORS
 
 PIXELS = 600
