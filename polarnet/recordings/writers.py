@@ -238,8 +238,6 @@ def export_store(
     suffix, write = FORMS[form]
     chosen = store.sequences if sequences is None else sequences
     for sequence in ProgressBar(chosen, "export", unit="sequence"):
-        if Path(sequence).name != sequence:
-            raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
         (folder / sequence).mkdir(parents=True, exist_ok=True)
         for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
             path = folder / sequence / f"polarizer_{angle:03d}{suffix}"

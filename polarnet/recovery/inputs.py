@@ -148,7 +148,7 @@ def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Ite
     """Pieces with the fewer pixels of `sums`, see `downscale`."""
     for piece in pieces:
         both = zip(piece.channels, sums, strict=True)
-        yield piece._replace(channels=[downscale(e, *own.shape, own) for e, own in both])
+        yield piece._replace(channels=[downscale(e, *own.shape, sums=own) for e, own in both])
 
 
 def _channels(files: Files, work: Path) -> Channels:
