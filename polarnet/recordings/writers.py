@@ -230,7 +230,7 @@ def export_store(
 ) -> None:
     """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence.
 
-    `sequences` are those to write; None: all. `form` is hdf5, text or evt3.
+    `sequences` are those to write; None: all. `form` is hdf5, text or evt3. ValueError for an unknown sequence.
     """
     folder = Path(folder)
     if form not in FORMS:
@@ -238,16 +238,16 @@ def export_store(
     suffix, write = FORMS[form]
     chosen = store.sequences if sequences is None else sequences
     for sequence in ProgressBar(chosen, "export", unit="sequence"):
+        offsets = store.record(sequence)["offsets"]
         (folder / sequence).mkdir(parents=True, exist_ok=True)
         for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
             path = folder / sequence / f"polarizer_{angle:03d}{suffix}"
             nothing = Events.empty(store.height, store.width)  # so that a channel without events has a size
-            write(path, itertools.chain([nothing], _channel_chunks(store, sequence, channel)))
+            write(path, itertools.chain([nothing], _chunks(store, sequence, *offsets[channel : channel + 2])))
 
 
-def _channel_chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
-    """The events of one channel of a sequence, in chunks."""
-    first, end = store.record(sequence)["offsets"][channel : channel + 2]
+def _chunks(store: EventStore, sequence: str, first: int, end: int) -> Iterator[Events]:
+    """Consecutive events of a sequence, in chunks."""
     for start in range(first, end, BLOCK):
         yield from store.rows(sequence, [(start, min(start + BLOCK, end))])
 
