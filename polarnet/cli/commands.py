@@ -258,7 +258,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - one file of a camera behind a rotating polarizer, with --rotating or --triggers
 - an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
 - a folder of division-of-time captures
-- with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
+- with --live, standard input (-) or a file with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera
 With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
     )
@@ -276,7 +276,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     )  # fmt: skip
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
-    add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
+    add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent camera has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
     _cleaning(recover)
     add(

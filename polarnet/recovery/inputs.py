@@ -96,7 +96,7 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
-    """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
+    """Read live from standard input (-), a file, or a camera (dv://...), which ends after `idle_s` without an event.
 
     ValueError for a camera without a mosaic.
     """
@@ -106,9 +106,9 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -
             raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
         reader = LiveCamera(path, mosaic, idle_s)
     elif path == STANDARD_INPUT:
-        reader = LiveLines(sys.stdin.buffer, "standard input", mosaic, idle_s)
+        reader = LiveLines(sys.stdin.buffer, "standard input", mosaic)
     elif Path(path).is_file():
-        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic, idle_s)  # noqa: SIM115 - read until the end
+        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic)  # noqa: SIM115 - read until the end
     else:
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     pieces = clean.clean(reader, live=True)
