@@ -92,7 +92,7 @@ def random_channels(height: int, width: int, windows: int) -> list[Events]:
 
 def windows_of(channels: Sequence[Events], windows: int) -> list[EventWindow]:
     """The first windows of the channels, one after the other."""
-    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), channels[0].height, channels[0].width)
+    cutter = WindowCutter(WindowRule(WINDOW_US, None), channels[0].height, channels[0].width)
     return list(cutter.add(channels, windows * WINDOW_US))
 
 

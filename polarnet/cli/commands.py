@@ -279,9 +279,7 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent camera has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
     _cleaning(recover)
-    add(
-        "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"
-    )
+    add("--window", help="length in time (default: 33.333ms, as in training)")
     add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
     add(
         "--method",

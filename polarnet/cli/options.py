@@ -1,11 +1,11 @@
 """Values of the options that several commands share."""
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.events.streaming import parse_window
 from polarnet.recordings.noise import FOUND, Cleaning
 
 READING = ("format", "height", "width")
@@ -33,13 +33,10 @@ def duration_us(options: argparse.Namespace, name: str, example: str) -> int | N
     text = getattr(options, name)
     if not text:
         return None
-    try:
-        time_us, _ = parse_window(text)
-    except ValueError:
-        time_us = None
-    if time_us is None:
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(us|ms|s)", text.strip())
+    if match is None:
         raise ValueError(f"--{name}: expected a time such as {example}, got {text}")
-    return time_us
+    return round(float(match[1]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match[2]])
 
 
 def given(options: argparse.Namespace, names: Sequence[str]) -> str:

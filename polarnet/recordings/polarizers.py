@@ -41,7 +41,7 @@ class ChannelCheck:
         self.counts = [0, 0, 0, 0]
         """Number of events in each channel."""
         self._mosaic = mosaic
-        self._cutter = WindowCutter(WindowRule(TRAINED_WINDOW_US, None, None), height, width)
+        self._cutter = WindowCutter(WindowRule(TRAINED_WINDOW_US, None), height, width)
         self._windows: list[EventWindow] = []
 
     def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:

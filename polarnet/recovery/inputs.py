@@ -133,7 +133,7 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
 
 def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule:
     """Consecutive windows of `step_us` (default: half a turn)."""
-    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None, None)
+    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
 
 
 def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
