@@ -136,7 +136,7 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
     return replace(cut, x=cut.x - left, y=cut.y - top, height=height, width=width)
 
 
-def downscale(events: Events, height: int, width: int, sums: Float64[np.ndarray, "h w"] | None = None) -> Events:
+def downscale(events: Events, height: int, width: int, *, sums: Float64[np.ndarray, "h w"] | None = None) -> Events:
     """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
 
     A coarse pixel keeps the threshold and the rate of a fine one: it fires each time the polarity sum of its fine
