@@ -1,4 +1,4 @@
-"""Write BIN and CSV files of a CeleX-5, for simulated cameras and for tests of the readers."""
+"""Write BIN files of a CeleX-5, for simulated cameras and for tests of the readers."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,19 +24,17 @@ from polarnet.recordings.formats.celex5 import (
     WIDTH,
     microseconds,
 )
-from polarnet.recordings.formats.lines import lines_of
 from polarnet.runtime.compilation import compiled
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
-CSV_LINES = 2**18  # written at a time
 STEP = 2**15  # time stamps from one row to the next, at most
 
 
-def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_MHZ) -> Events:
+def write_celex5_bin(path: Path, events: Events) -> Events:
     """Write events as the sensor sends them, and return the events that a reader gets from the file.
 
-    Each time becomes the sensor's first time stamp at or after it (every 10.24 us at 100 MHz), from 0 on. Polarity is a
+    Each time becomes the sensor's first time stamp at or after it (every 10.24 us), from 0 on. Polarity is a
     change of intensity, which starts from 0, so a pixel that first becomes darker gets a brighter event at the start.
     ValueError for events that are out of order, before 0, off a sensor of 800 x 1280, or more than 4095 of one polarity
     in a row in a pixel.
@@ -45,7 +43,7 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
     validate(events)
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
-    stamp = -(-events.t.numpy() * round(1000 * clock_mhz) // (1000 * TICK_CYCLES))
+    stamp = -(-events.t.numpy() * CLOCK_MHZ // TICK_CYCLES)
     pixel, p = events.y.numpy().astype(np.int64) * WIDTH + events.x.numpy(), events.p.numpy()
     _, first = np.unique(pixel, return_index=True)
     darker = np.sort(first[p[first] < 0])
@@ -58,7 +56,7 @@ def write_celex5_bin(path: Path, events: Events, clock_mhz: float | int = CLOCK_
         raise ValueError(f"expected up to {WHITE} events of one polarity in a row, a pixel has {brightest}")
     items = items[:count]
     _write_packages(path, _packed(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)))
-    return Events.from_columns(microseconds(stamp, clock_mhz), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
+    return Events.from_columns(microseconds(stamp), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
 
 
 def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800 1280"]], t_us: Sequence[int]) -> None:
@@ -75,20 +73,6 @@ def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800
                 )
             file.write(LENGTH.pack(PICTURE_BYTES) + _packed_picture(picture).tobytes() + b"\0")
             file.write(STAMP.pack(t // 1000, 0))
-
-
-def write_celex5_csv(path: Path, events: Events) -> None:
-    """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
-
-    The intensity is half of the maximum. ValueError where events are not on the sensor of 800 x 1280.
-    """
-    _check_size(events)
-    adc = np.full(len(events), WHITE // 2)
-    columns = [events.y.numpy(), events.x.numpy(), adc, events.p.numpy(), events.t.numpy()]
-    with path.open("wb") as file:
-        for start in range(0, len(events), CSV_LINES):
-            part = [column[start : start + CSV_LINES] for column in columns]
-            file.write(lines_of(np.stack(part, axis=1).astype(np.int64), ","))
 
 
 def _check_size(events: Events) -> None:

@@ -15,7 +15,7 @@ from polarnet.recordings.formats.aedat3 import PACKET
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
-from studies.celex5_writer import write_celex5_bin, write_celex5_csv
+from studies.celex5_writer import write_celex5_bin
 from studies.rosbag_writer import array_bytes, write_arrays, write_packets
 
 PACKET_EVENTS = 10_000
@@ -174,7 +174,7 @@ PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};widt
 AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
 FILES: dict[str, tuple[str, Writer]] = {
     **{name: (".h5", table_writer(name)) for name in LAYOUTS},
-    "dsec of polarnet": (".h5", lambda path, events: write_hdf5(path, events, None)),
+    "dsec of polarnet": (".h5", write_hdf5),
     "rosbag": (".bag", messages(write_arrays, array_bytes)),
     "rosbag of EventPacket": ("", messages(write_packets, lambda *columns: ("evt3", 0, evt3(*columns)))),
     "aedat4": (".aedat4", with_faery),
@@ -197,7 +197,7 @@ FILES: dict[str, tuple[str, Writer]] = {
             lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes(),
         ),
     ),
-    "text": (".txt", lambda path, events: write_text(path, events, None)),
+    "text": (".txt", write_text),
     "text of microseconds": (
         ".txt",
         binary("{width} {height}\n", lambda *columns: lines_of(np.stack(columns, axis=1), " ")),
@@ -206,7 +206,6 @@ FILES: dict[str, tuple[str, Writer]] = {
         ".csv",
         binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
     ),
-    "celex5_csv": (".csv", write_celex5_csv),
     "celex5_bin": (".bin", write_celex5_bin),
 }
 """Suffix and writer of each format, and of further kinds of files whose first word is the format."""

@@ -42,7 +42,7 @@ from studies.study import (
 COUNT, SMALL = 10_000_000, 20_000  # events; the small file compiles every kernel
 PART = 1_000_000  # events that are made at a time, and microseconds that they take
 REPEATS = 3
-SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_csv": (800, 1280), "celex5_bin": (800, 1280)}
+SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_bin": (800, 1280)}
 SENSOR = 720, 1280  # of the other formats
 PARTS = {"m3ed": "left", "mvsec": "left"}
 MEMORY_SIZES = (2_000_000, 8_000_000, 32_000_000, 128_000_000)
@@ -112,8 +112,8 @@ def speed_of_writer(form: str) -> float:
     suffix, write = FORMS[form]
     events = concatenate(list(parts(COUNT, *SENSOR)))
     with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder, f"small{suffix}"), parts(SMALL, *SENSOR), None)
-        return round(COUNT / shortest_cpu_s(lambda: write(Path(folder, f"large{suffix}"), events, None)) / 1e6, 2)
+        write(Path(folder, f"small{suffix}"), parts(SMALL, *SENSOR))
+        return round(COUNT / shortest_cpu_s(lambda: write(Path(folder, f"large{suffix}"), events)) / 1e6, 2)
 
 
 def peak_mib() -> float:
@@ -162,7 +162,7 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
         for size in MEMORY_SIZES:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, f"recording{suffix}")
-                write(path, parts(size, *MEMORY_SENSOR), None)
+                write(path, parts(size, *MEMORY_SENSOR))
                 peaks[size] = {name: measured(name, str(path)) for name in (*COMMANDS, "array")}
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}

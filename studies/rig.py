@@ -15,8 +15,7 @@ from skimage import data
 from polarnet.captures.dot import EVENT_CAPTURES, read_event_capture
 from polarnet.captures.targets import calibrate_targets
 from polarnet.config.tree import load
-from polarnet.events.stream import slice_time
-from polarnet.recordings.arrangements import shifted
+from polarnet.events.stream import shifted, slice_time
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.writers import write_hdf5
@@ -56,9 +55,8 @@ def main() -> None:
         events = read_event_capture(scratch / "raw" / name / f"{first}.bin", recordings)
         start_us, capture = found.start_us[first], scratch / "events_0.h5"
         common = shifted(slice_time(events, start_us, start_us + found.duration_us), start_us)
-        write_hdf5(capture, common, found.duration_us)
-        assert recordings.hot_pixel_factor is not None
-        inspection = inspect_recording(open_recording(capture), recordings.hot_pixel_factor)
+        write_hdf5(capture, common)
+        inspection = inspect_recording(open_recording(capture))
     (PICTURES / "recordings_inspect.png").write_bytes(recording_picture(inspection))
     lines = [f"$ polarnet inspect {capture.name}", *findings(inspection), f"picture     {capture.name}.png"]
     (ROOT / "docs" / "results" / "inspection.json").write_text(json.dumps({"text": "\n".join(lines)}, indent=2) + "\n")

@@ -16,8 +16,7 @@ from jaxtyping import Float64, Int64, UInt16
 
 from polarnet import stokes
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, RecordingsConfig
-from polarnet.events.stream import Events, merge, select
-from polarnet.recordings.arrangements import shifted
+from polarnet.events.stream import Events, merge, select, shifted
 from polarnet.recordings.formats.celex5 import HEIGHT, WHITE, WIDTH
 from polarnet.runtime.machine import generator_for, seed_for
 from polarnet.simulation.camera import Camera

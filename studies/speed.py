@@ -31,12 +31,11 @@ import numpy as np
 import torch
 
 from polarnet.config.tree import load
-from polarnet.events.stream import Events, concatenate
+from polarnet.events.stream import Events, concatenate, shifted
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import shifted
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
@@ -87,7 +86,7 @@ def random_windows(height: int, width: int, windows: int) -> list[EventWindow]:
         p = np.tile(generator.choice([-1, 1], count), windows)
         return Events.from_columns(t, (x + SHIFT * number) % width, y, p, height, width)
 
-    cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
+    cutter = WindowCutter(WindowRule(WINDOW_US, None), height, width)
     return list(cutter.add([random_channel() for _ in range(4)], windows * WINDOW_US))
 
 

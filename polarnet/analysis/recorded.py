@@ -10,9 +10,9 @@ import torch
 
 from polarnet.captures.alignment import MAX_PICTURES, Lag, best_lag, logarithms, steps
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events, shifted, slice_time
 from polarnet.events.streaming import TRAINED_WINDOW_US
-from polarnet.recordings.arrangements import Piece, shifted
+from polarnet.recordings.arrangements import Piece
 from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
 from polarnet.recordings.recording import detect_format, read_recording

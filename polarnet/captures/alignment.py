@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 
 from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, over_time
+from polarnet.events.intervals import Intervals, by_pixel, intervals_of
 from polarnet.events.stream import Events, crop
 from polarnet.recordings.source import RecordingError
 
@@ -33,17 +34,6 @@ LANDMARK_ERROR_US = 500.0  # typical difference between the landmark's times in 
 REDUNDANCY_SHARE = 1e-3  # share of the samples assumed independent: neighbours in space and time are not
 ITERATIONS = 6
 POLARIZER_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])  # I0 - I45 + I90 - I135 = 0
-
-
-class Steps(NamedTuple):
-    """Pairs of consecutive events of the same pixel within the crop."""
-
-    before_us: Int64[np.ndarray, " n"]
-    after_us: Int64[np.ndarray, " n"]
-    pixel: Int64[np.ndarray, " n"]
-    """Index in row-major order."""
-    polarity: Int8[np.ndarray, " n"]
-    """Polarity of the second event."""
 
 
 class Thresholds(NamedTuple):
@@ -66,19 +56,12 @@ class Lag(NamedTuple):
     thresholds: Thresholds
 
 
-def steps(events: Events, corner: tuple[int, int], size: tuple[int, int], start_us: int, stop_us: int) -> Steps:
-    """Pairs within a crop (its upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
-    part = crop(events, *corner, *size)
-    pixels = part.y.numpy().astype(np.int64) * part.width + part.x.numpy()
-    order = np.argsort(pixels, kind="stable")
-    second = np.flatnonzero(np.diff(pixels[order]) == 0) + 1
-    pairs = np.stack([order[second - 1], order[second]])
-    before, after = pairs[:, np.argsort(pairs[1])]
-    t = part.t.numpy()
-    sample = np.flatnonzero((t[before] >= start_us) & (t[after] < stop_us))
-    sample = sample[:: max(1, -(-len(sample) // MAX_STEPS))]
-    before, after = before[sample], after[sample]
-    return Steps(t[before], t[after], pixels[after], part.p.numpy()[after])
+def steps(events: Events, corner: tuple[int, int], size: tuple[int, int], start_us: int, stop_us: int) -> Intervals:
+    """Intervals in a crop (its upper left corner as row, column) and [start_us, stop_us), thinned to 300,000."""
+    pairs = intervals_of(by_pixel(crop(events, *corner, *size)))
+    pairs = pairs.chosen(np.argsort(pairs.stop_us, kind="stable"))
+    sample = np.flatnonzero((pairs.start_us >= start_us) & (pairs.stop_us < stop_us))
+    return pairs.chosen(sample[:: max(1, -(-len(sample) // MAX_STEPS))])
 
 
 def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n hw"]:
@@ -89,13 +72,13 @@ def logarithms(pictures: UInt16[np.ndarray, "n h w"]) -> Float32[np.ndarray, "n 
 
 
 def changes(
-    pairs: Steps, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
+    pairs: Intervals, lag_us: float | int, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"]
 ) -> Float64[np.ndarray, " m"]:
     """Change of log intensity over each step, interpolated between pictures taken at `t_us` with a delay of `lag_us`.
 
     NaN where a step is not between the pictures, or too dark.
     """
-    start, stop = pairs.before_us + float(lag_us), pairs.after_us + float(lag_us)
+    start, stop = pairs.start_us + lag_us, pairs.stop_us + lag_us
     between = (start >= t_us[0]) & (stop <= t_us[-1])
 
     def at(t: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -132,7 +115,7 @@ def thresholds(polarity: Int8[np.ndarray, " n"], change: Float64[np.ndarray, " n
 
 
 def best_lag(
-    pairs: Steps, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
+    pairs: Intervals, t_us: Int64[np.ndarray, " n"], logs: Float32[np.ndarray, "n hw"], within_us: float | int
 ) -> Lag:
     """Delay of the pictures' clock relative to the events' clock: the lag at which they agree best.
 
@@ -153,7 +136,7 @@ def best_lag(
     change = changes(pairs, lag_us, t_us, logs)
     bright = changes(pairs, lag_us, t_us, np.where(logs < np.log(np.float32(BRIGHT)), np.float32(np.nan), logs))
     # steps shorter than the frame interval are left out: the light did not change evenly between two pictures
-    bright[pairs.after_us - pairs.before_us < np.median(np.diff(t_us))] = np.nan
+    bright[pairs.duration_us < np.median(np.diff(t_us))] = np.nan
     return Lag(lag_us, agreement(pairs.polarity, change), searched, agreements, thresholds(pairs.polarity, bright))
 
 

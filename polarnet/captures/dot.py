@@ -48,10 +48,6 @@ class RecordingsConfig:
     """Size of the central crop."""
     size: list[Annotated[int, Field(ge=2, le=1280)]]
     """Size to which the crop is reduced."""
-    keep_event_rate: bool
-    """true: a reduced pixel fires as often as one sensor pixel; false: as often as all those it covers together."""
-    picture_rate_hz: PositiveFloat | None
-    """Rate of the pictures in intensity captures whose files have no times."""
     hot_pixel_factor: Annotated[float, Field(gt=1)] | None
     """A pixel is hot, and left out, above this multiple of the third busiest of the 5 x 5 around it; null: none is."""
     alignment: Annotated[str, one_of(("landmark", "refined"))]
@@ -59,9 +55,7 @@ class RecordingsConfig:
     refine_within_ms: PositiveFloat
     """Search range of the refined start times around the landmark's."""
     frame_rate_hz: PositiveFloat
-    """Frame rate of the sequence's ground truth."""
-    duration_s: PositiveFloat | None
-    """Length of the sequence, from the landmark on; null: as long as all captures last."""
+    """Frame rate of the sequence's ground truth, which lasts as long as all captures do from the landmark on."""
 
     def __post_init__(self):
         for inner, outer in (("sensor", "sensor"), ("region", "sensor"), ("crop", "sensor"), ("size", "crop")):
@@ -91,7 +85,7 @@ class IntensityCapture(NamedTuple):
 def find_captures(folder: Path) -> dict[str, Path]:
     """The eight captures of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
 
-    An intensity capture is a BIN file, a video, or a folder of frames; intensity_0.txt holds the times of a video.
+    An intensity capture is a BIN file, a video, or a folder of frames; intensity_0.txt holds the times of a file.
     RecordingError where a capture has no file or more than one.
     """
     captures = {}
@@ -136,42 +130,41 @@ def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
 def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
     """The pictures of a BIN file, a video or a folder of frames, whose values are linear in light.
 
-    RecordingError where they are fewer than two, without times, or smaller than the sensor.
+    A text of times, intensity_0.txt or timestamps.txt in the folder, comes before the times in a file. RecordingError
+    where the pictures are fewer than two, without times, or smaller than the sensor.
     """
     (top, left), (height, width) = config.crop_corner, config.crop
+    text = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
+    stated = times_from_file(text, "us").tolist() if text.is_file() else None
     times, pictures, region = [], [], []
     bin_file = path.is_file() and path.suffix.lower().lstrip(".") not in VIDEOS
-    for k, picture in enumerate(celex5_pictures(path) if bin_file else _frames(path)):
+    for picture in celex5_pictures(path) if bin_file else _frames(path):
         if any(side < used for side, used in zip(picture.intensity.shape, config.sensor, strict=True)):
             size = "x".join(map(str, picture.intensity.shape))
             raise RecordingError(f"{path.name}: recordings.sensor is {config.sensor}, its pictures are {size}")
-        if picture.t_us is None and config.picture_rate_hz is None:
+        if picture.t_us is None and stated is None:
             raise RecordingError(
-                f"{path.name}: its pictures have no times (a BIN file recorded without the IMU's data, or frames "
-                f"without {TIMES_FILE}); set recordings.picture_rate_hz to the rate they were taken at"
+                f"{path.name}: its pictures have no times (a BIN file recorded without the IMU's data, or frames of a "
+                f"folder); write microseconds into {text.name}, a line for each picture"
             )
-        times.append(round(k * 1e6 / config.picture_rate_hz) if config.picture_rate_hz else picture.t_us)
+        times.append(picture.t_us)
         pictures.append(picture.intensity[top : top + height, left : left + width].copy())
         region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
     if len(pictures) < 2:
         raise RecordingError(f"{path.name}: expected at least two full pictures, got {len(pictures)}")
-    t_us = check_times(np.array(times, np.float64), path.name) + times[0]
-    return IntensityCapture(t_us, np.stack(pictures), np.array(region))
+    if stated is not None and len(stated) != len(pictures):
+        raise RecordingError(
+            f"{path.name}: expected a time for each of {len(pictures)} pictures, {text.name} has {len(stated)}"
+        )
+    t_us = np.array(times if stated is None else stated, np.float64)
+    return IntensityCapture(check_times(t_us, path.name) + round(t_us[0]), np.stack(pictures), np.array(region))
 
 
 def _frames(path: Path) -> Iterator[Picture]:
-    """Frames of a video or a folder as grey pictures on the scale of a BIN file, timed by a text or the video."""
-    file = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
-    stated = times_from_file(file, "us") if file.is_file() else None
-    clip = open_clip(path, ClipOptions(grey=True))
-    if stated is not None and clip.count not in (None, len(stated)):
-        raise RecordingError(
-            f"{path.name}: expected a time for each of {clip.count} frames, {file.name} has {len(stated)}"
-        )
-    for k, frame in enumerate(clip.frames()):
-        t_us = frame.t_us if stated is None else float(stated[k])
+    """Frames of a video, with its times, or of a folder as grey pictures on the scale of a BIN file."""
+    for frame in open_clip(path, ClipOptions(grey=True)).frames():
         grey = np.rint(frame.pixels[..., 0] * (255 * STEPS_OF_8_BITS)).astype(np.uint16)
-        yield Picture(None if t_us is None else round(t_us), grey)
+        yield Picture(None if frame.t_us is None else round(frame.t_us), grey)
 
 
 def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float32[np.ndarray, "h2 w2"]:

@@ -29,8 +29,7 @@ from polarnet.captures.dot import (
     read_intensity_capture,
     region_negative_times_us,
 )
-from polarnet.events.stream import Events, crop, downscale, slice_time
-from polarnet.recordings.arrangements import shifted
+from polarnet.events.stream import Events, crop, downscale, shifted, slice_time
 from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore
@@ -46,6 +45,9 @@ class Target(NamedTuple):
 
     name: str
     events: Mapping[str, Events]
+    """Events without those of hot pixels."""
+    hot: Mapping[str, int]
+    """Number of hot pixels in each event capture."""
     intensities: Mapping[str, IntensityCapture]
     given: Mapping[str, int]
     """Start times set by hand."""
@@ -53,13 +55,16 @@ class Target(NamedTuple):
 
 def read_target(folder: Path, config: RecordingsConfig) -> Target:
     """The captures in a target's folder; RecordingError where a file is missing or damaged."""
-    files = find_captures(folder)
-    return Target(
-        folder.name,
-        {capture: read_event_capture(files[capture], config) for capture in EVENT_CAPTURES},
-        {capture: read_intensity_capture(files[capture], config) for capture in INTENSITY_CAPTURES},
-        given_starts(folder),
-    )
+    files, clean, hot = find_captures(folder), {}, {}
+    for capture in EVENT_CAPTURES:
+        events = read_event_capture(files[capture], config)
+        bad = np.zeros((events.height, events.width), np.bool_)
+        if config.hot_pixel_factor is not None:
+            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
+            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
+        clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
+    intensities = {capture: read_intensity_capture(files[capture], config) for capture in INTENSITY_CAPTURES}
+    return Target(folder.name, clean, hot, intensities, given_starts(folder))
 
 
 def start_over(out: Path, *, enabled: bool) -> None:
@@ -106,8 +111,8 @@ def calibrate_targets(
     targets = []
     for folder in ProgressBar(folders, "calibrate", unit="target"):
         target = read_target(folder, config)
-        one, clean = calibrate_target(target, config)
-        channels, t_us, intensity = aligned(target._replace(events=clean), one, config)
+        one = calibrate_target(target, config)
+        channels, t_us, intensity = aligned(target, one, config)
         vectors = stokes.stokes_from_intensities(intensity)
         events.write(target.name, channels, int(t_us[-1]))
         frames.write(target.name, t_us, intensity, stokes.dolp(vectors).clamp(0, 1), stokes.aolp(vectors))
@@ -119,53 +124,45 @@ def calibrate_targets(
     return targets
 
 
-def calibrate_target(target: Target, config: RecordingsConfig) -> tuple[Calibrated, dict[str, Events]]:
-    """Start times of a target's captures, and its events without those of hot pixels."""
-    clean, hot = {}, {}
-    for capture, events in target.events.items():
-        bad = np.zeros((events.height, events.width), np.bool_)
-        if config.hot_pixel_factor is not None:
-            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
-            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
-        clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
+def calibrate_target(target: Target, config: RecordingsConfig) -> Calibrated:
+    """Start times of a target's captures; RecordingError where one is not found, or what they have in common short."""
     try:
-        starts = landmark_starts(clean, target.intensities, config, target.given)
+        starts = landmark_starts(target.events, target.intensities, config, target.given)
         alignment = None
         if config.alignment == "refined":
-            alignment = refined_starts(starts, clean, target.intensities, config, target.given)
+            alignment = refined_starts(starts, target.events, target.intensities, config, target.given)
     except RecordingError as error:
         raise RecordingError(f"target {target.name}: {error}") from None
     used = starts if alignment is None else alignment.start_us
-    ends = [int(clean[capture].t[-1]) - used[capture] if len(clean[capture]) else 0 for capture in EVENT_CAPTURES]
-    ends += [int(target.intensities[capture].t_us[-1]) - used[capture] for capture in INTENSITY_CAPTURES]
-    duration_us = min(ends) if config.duration_s is None else round(config.duration_s * 1e6)
-    if duration_us > min(ends) or len(frame_times_us(max(duration_us, 0), config)) < 2:
+    ends = [int(events.t[-1]) - used[capture] if len(events) else 0 for capture, events in target.events.items()]
+    ends += [int(pictures.t_us[-1]) - used[capture] for capture, pictures in target.intensities.items()]
+    duration_us = min(ends)
+    if len(frame_times_us(max(duration_us, 0), config)) < 2:
         raise RecordingError(
-            f"target {target.name}: after their starts the captures have {min(ends) * 1e-6:.3f} s in common; expected "
-            f"at least {config.duration_s or 1 / config.frame_rate_hz:.3f} s. Is a start wrong? Used: {dict(used)} us"
+            f"target {target.name}: after their starts the captures have {duration_us * 1e-6:.3f} s in common; "
+            f"expected at least {1 / config.frame_rate_hz:.3f} s. Is a start wrong? Used: {dict(used)} us"
         )
     late = [c for c in INTENSITY_CAPTURES if target.intensities[c].t_us[0] > used[c]]
     if late:
         raise RecordingError(f"target {target.name}: {', '.join(late)} has no picture before its start; record earlier")
-    calibrated = Calibrated(
+    return Calibrated(
         target.name,
         starts,
         used,
         alignment,
-        hot,
-        {capture: region_negative_times_us(events, config).numpy() for capture, events in clean.items()},
+        target.hot,
+        {capture: region_negative_times_us(events, config).numpy() for capture, events in target.events.items()},
         {capture: (pictures.t_us, pictures.region) for capture, pictures in target.intensities.items()},
         duration_us,
     )
-    return calibrated, clean
 
 
 def aligned(
     target: Target, calibrated: Calibrated, config: RecordingsConfig
 ) -> tuple[list[Events], Int64[Tensor, " n"], Float32[Tensor, "n 4 h w"]]:
-    """The sequence of a target without hot pixels: events of its four channels, frame times, intensities in [0, 1].
+    """The sequence of a target: events of its four channels, frame times, intensities in [0, 1].
 
-    The events are those of the crop from the common start on, reduced by `downscale` with the rule `keep_event_rate`.
+    The events are those of the crop from the common start on, reduced by `downscale`.
     The intensities come from the reduced pictures before and after each frame's time, interpolated.
     """
     t_us = frame_times_us(calibrated.duration_us, config)
@@ -174,7 +171,7 @@ def aligned(
         events, start = target.events[capture], calibrated.start_us[capture]
         during = shifted(slice_time(events, start, start + int(t_us[-1]) + 1), start)
         part = crop(during, *config.crop_corner, *config.crop)
-        channels.append(downscale(part, config.size[0], config.size[1], keep_rate=config.keep_event_rate))
+        channels.append(downscale(part, config.size[0], config.size[1]))
     planes = []
     for name in INTENSITY_CAPTURES:
         frames = over_time(target.intensities[name], calibrated.start_us[name], config)(t_us)

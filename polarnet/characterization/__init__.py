@@ -1,1 +1,1 @@
-"""Estimators of a real sensor's parameters from its recordings, and the comparison with its simulated twin."""
+"""Estimators of a real sensor's parameters from its recordings."""

@@ -14,9 +14,10 @@ from polarnet.characterization.flicker import (
     source_of,
     thresholds_without_leak,
 )
-from polarnet.characterization.intervals import GROUPS, Estimate, by_pixel, chosen_pixels, intervals_of, piled_up_us
+from polarnet.characterization.intervals import GROUPS, Estimate, piled_up_us
 from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
 from polarnet.characterization.thresholds import PixelThresholds, correlation, deviation
+from polarnet.events.intervals import by_pixel, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
 from polarnet.terminal.progress import ProgressBar
@@ -45,6 +46,10 @@ class SensorFit:
             self.missing[name] = reason
         else:
             self.estimates[name] = estimate
+
+    def parameters(self) -> dict[str, float]:
+        """Values for section `emulate` of params.yaml, rounded to four digits: only the estimated ones."""
+        return {name: float(f"{one.value:.4g}") for name, one in self.estimates.items()}
 
 
 def fit_sensor(

@@ -18,16 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import minimize_scalar
 
-from polarnet.characterization.intervals import (
-    GROUPS,
-    MAX_RELATIVE_ERROR,
-    Estimate,
-    Intervals,
-    PixelEvents,
-    intervals_of,
-    undisturbed,
-)
+from polarnet.characterization.intervals import GROUPS, MAX_RELATIVE_ERROR, Estimate, undisturbed
 from polarnet.characterization.thresholds import PixelThresholds, misfit, pixel_thresholds
+from polarnet.events.intervals import Intervals, PixelEvents, intervals_of
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.light import FULL_SCALE, respond_as_v2e
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, PixelConfig, physics_of
@@ -151,7 +144,7 @@ def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:
     for source in sources:
         intervals = source.intervals
         before, after = (source.responses(t_us, cutoff_hz) for t_us in (intervals.start_us, intervals.stop_us))
-        increment = np.where(intervals.on, 1.0, -1.0) * (after - before)
+        increment = intervals.polarity * (after - before)
         block = np.arange(len(increment)) // BLOCK
         parts.append((increment, intervals.duration_us * 1e-6, intervals.pixel, intervals.on, block))
     return Increments(*map(np.concatenate, zip(*parts, strict=True)))

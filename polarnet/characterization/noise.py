@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.optimize import brentq
 
-from polarnet.characterization.intervals import Estimate, PixelEvents, chosen_pixels, intervals_of
+from polarnet.characterization.intervals import Estimate
+from polarnet.events.intervals import PixelEvents, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.recordings.noise import event_counts, hot_pixels
 from polarnet.simulation.pixels.physics import PixelConfig, shot_noise_fraction

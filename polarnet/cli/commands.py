@@ -258,7 +258,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - one file of a camera behind a rotating polarizer, with --rotating or --triggers
 - an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
 - a folder of division-of-time captures
-- with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
+- with --live, standard input (-) or a file with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera
 With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
     )
@@ -276,12 +276,10 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     )  # fmt: skip
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
-    add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
+    add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent camera has ended (default: 5)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
     _cleaning(recover)
-    add(
-        "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"
-    )
+    add("--window", help="length in time (default: 33.333ms, as in training)")
     add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
     add(
         "--method",
@@ -331,8 +329,8 @@ def _fit_sensor(command: AddCommand) -> None:
         "fit the simulated sensor to a camera's recordings",
         "fit-sensor --name lab --static wall.raw --flicker f2.raw f60.raw --frequency 2 60 --contrast 0.8",
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
-        "pixels of a camera from its recordings; prints a table, writes conf/sensor/NAME.yaml, and says how alike each "
-        "recording and its simulated twin are. docs/fit-sensor.md says what to record.",
+        "pixels of a camera from its recordings; prints a table and writes conf/sensor/NAME.yaml. docs/fit-sensor.md "
+        "says what to record.",
     )
     add = fit.add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
@@ -402,10 +400,9 @@ def _cleaning(command: Command) -> None:
 
 def _reading(command: Command) -> None:
     """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
-    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
+    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_bin, ...")
     command.add_argument(
         "--part", help="of a file with several: topic of a bag, stream of AEDAT, camera of M3ED or MVSEC"
     )
     command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
     command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
-    command.add_argument("--clock-mhz", type=float, help="clock of a CeleX-5 (default: 100)")

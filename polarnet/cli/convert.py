@@ -7,11 +7,10 @@ from pathlib import Path
 from polarnet.cli.options import READING, duration_us, reading_of, refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.stores import is_store
-from polarnet.events.stream import Events, slice_time
+from polarnet.events.stream import Events, shifted, slice_time
 from polarnet.networks.onnx_export import TOLERANCE, export_network
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.recording import RecordingReader, open_recording
 from polarnet.recordings.repair import MAX_TIME
 from polarnet.recordings.source import RecordingError
@@ -52,7 +51,7 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     reader = open_recording(file, **reading_of(options))
     span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
-        FORMS[form][1](temporary, span.chunks(reader), None)
+        FORMS[form][1](temporary, span.chunks(reader))
         if start_us and not span.count:
             raise ValueError(f"{file.name}: expected events between --start and --stop, there are none; leave them out")
     print(f"{file} ({reader.format}) -> {options.out} ({form}): {span.count:,} events, time 0 is {span.origin_us} us")

@@ -6,10 +6,8 @@ from pathlib import Path
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
 from polarnet.characterization.flicker import Flicker, FlickerRecording
-from polarnet.characterization.twin import compare, fitted_parameters, fitted_sensor
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
-from polarnet.events.stream import Events
 from polarnet.recordings.recording import read_recording
 from polarnet.simulation.presets import SENSORS
 from polarnet.terminal.progress import ProgressBar
@@ -33,7 +31,7 @@ UNITS = {
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit, print the table, write the sensor, and print how alike each recording and its simulated twin are."""
+    """Fit, print the table and write the sensor."""
     check_options(options)
     preset = _preset_path(options.name)
 
@@ -43,15 +41,10 @@ def run(options: argparse.Namespace) -> None:
     ]
     static = recordings.pop(0) if options.static else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
-    flickers: list[FlickerRecording] = []
-    lights: list[tuple[str, Events, Flicker | float]] = []
-    if static is not None:
-        lights.append((f"static: {options.static.name}", static, static_light))
-    flickering = zip(options.flicker or [], recordings, options.frequency or [], strict=True)
-    for path, events, frequency_hz in flickering:
-        flicker = Flicker(options.flicker_light, options.contrast, frequency_hz)
-        flickers.append(FlickerRecording(f"flicker {frequency_hz:g} Hz", events, flicker))
-        lights.append((f"flicker: {path.name}", events, flicker))
+    flickers = [
+        FlickerRecording(f"flicker {hz:g} Hz", events, Flicker(options.flicker_light, options.contrast, hz))
+        for events, hz in zip(recordings, options.frequency or [], strict=True)
+    ]
     fit = fit_sensor(static, static_light, flickers, SENSORS["default"])
     notes = list(fit.notes)
     if options.static and options.static_light is None:
@@ -64,11 +57,7 @@ def run(options: argparse.Namespace) -> None:
     for note in notes:
         print(f"note: {note}")
     preset.parent.mkdir(parents=True, exist_ok=True)
-    preset.write_text(_preset_text(options.name, fitted_parameters(fit)), encoding="utf-8")
-    sensor = fitted_sensor(fit, SENSORS["default"])
-    for name, events, light in lights:
-        if len(events) > 1:
-            print(f"{name}: {compare(events, light, sensor, seed=1).verdict}")
+    preset.write_text(_preset_text(options.name, fit.parameters()), encoding="utf-8")
     print(f"sensor      {preset} (use it with sensor={options.name})")
 
 

@@ -1,14 +1,14 @@
 """Values of the options that several commands share."""
 
 import argparse
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.events.streaming import parse_window
-from polarnet.recordings.noise import FOUND, HOT_FACTOR, Cleaning
+from polarnet.recordings.noise import FOUND, Cleaning
 
-READING = ("format", "height", "width", "clock_mhz")
+READING = ("format", "height", "width")
 """Options that describe a camera's file where the file itself does not."""
 CLEANING = ("hot_pixels", "background")
 
@@ -25,7 +25,7 @@ def cleaning_of(options: argparse.Namespace) -> Cleaning:
         hot = str(Path(hot).resolve())
         if not Path(hot).is_file():
             raise FileNotFoundError(f"--hot-pixels {options.hot_pixels}: expected {FOUND} or a file, there is none")
-    return Cleaning(hot, HOT_FACTOR, duration_us(options, "background", "10ms"))
+    return Cleaning(hot, duration_us(options, "background", "10ms"))
 
 
 def duration_us(options: argparse.Namespace, name: str, example: str) -> int | None:
@@ -33,13 +33,10 @@ def duration_us(options: argparse.Namespace, name: str, example: str) -> int | N
     text = getattr(options, name)
     if not text:
         return None
-    try:
-        time_us, _ = parse_window(text)
-    except ValueError:
-        time_us = None
-    if time_us is None:
+    match = re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(us|ms|s)", text.strip())
+    if match is None:
         raise ValueError(f"--{name}: expected a time such as {example}, got {text}")
-    return time_us
+    return round(float(match[1]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match[2]])
 
 
 def given(options: argparse.Namespace, names: Sequence[str]) -> str:

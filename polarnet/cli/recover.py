@@ -15,7 +15,7 @@ from polarnet.cli.stores import is_store
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import Config, load
 from polarnet.events.rotation import Rotation
-from polarnet.events.streaming import WindowRule, parse_window
+from polarnet.events.streaming import TRAINED_WINDOW_US, WindowRule
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Setup, why_absent
 from polarnet.recordings.noise import Cleaner
@@ -43,7 +43,6 @@ WHOLE_METHOD, PAST_METHOD, ROTATING_METHOD = "registered", "ours", "rotating_pol
 """Methods unless --method names one: over a whole recording, from window to window, and with one polarizer."""
 RECONSTRUCT = "highpass"
 """Method whose intensities are the S0 of the video."""
-NETWORK_WINDOW = "33.333ms"
 ARRANGEMENTS = ("angles", "mosaic", "rotating", "triggers", "sequence")
 """Options that say where the polarizers are."""
 NOT_LIVE = ("angles", "rotating", "triggers", "sequence", "truth", "frames", "size", "part", *READING)
@@ -121,7 +120,7 @@ def _rotating(options: argparse.Namespace) -> tuple[Input | None, Rotation | Non
     """Input and rotation of one camera behind a rotating polarizer, None for any other input; and the windows."""
     step_us = duration_us(options, "step", "0.1ms")
     if options.rotating is None and options.triggers is None:
-        return None, None, WindowRule(*parse_window(options.window or NETWORK_WINDOW), step_us)
+        return None, None, WindowRule(duration_us(options, "window", "33.3ms") or TRAINED_WINDOW_US, step_us)
     rotation = rotation_of(options.rotating, options.triggers, options.start_angle or 0.0)
     open_file = functools.partial(open_recording, **reading_of(options))
     source, rotation = open_rotating(Path(options.input[0]), rotation, open_file, options.size)

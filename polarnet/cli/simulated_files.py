@@ -147,7 +147,7 @@ def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, 
             continue
         suffix, write = FORMS[form]
         for sensor, events in sensors.items():
-            write(output.folder / f"{sensor}{suffix}", events, duration_us)
+            write(output.folder / f"{sensor}{suffix}", events)
             files.append(f"{sensor}{suffix}")
     return files
 

@@ -13,7 +13,7 @@ from polarnet.config.origins import origin_problems
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
-from polarnet.recordings.noise import HOT_FACTOR, write_hot_pixels
+from polarnet.recordings.noise import write_hot_pixels
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
@@ -40,7 +40,7 @@ def inspect(options: argparse.Namespace) -> None:
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
-    inspection = inspect_recording(open_recording(file, **reading_of(options)), HOT_FACTOR)
+    inspection = inspect_recording(open_recording(file, **reading_of(options)))
     print(*findings(inspection), sep="\n")
     folder = options.out or Path("outputs", "inspect")
     folder.mkdir(parents=True, exist_ok=True)

@@ -18,10 +18,8 @@ Encode = Callable[[Events, int], Tensor]
 def event_tensor(events: Events, window_us: int) -> Float[Tensor, "h w"]:
     """Polarities summed per pixel, each weighted by its time since the first event (paper Eq. 5).
 
-    Time counts from the first event of this channel in the window, in window lengths; ValueError for none.
+    Time counts from the first event of this channel in the window, in window lengths.
     """
-    if window_us <= 0:
-        raise ValueError(f"expected a window longer than 0 us, got {window_us}")
     elapsed = (events.t - events.t[:1]) / window_us
     image = elapsed.new_zeros(events.height * events.width).index_add_(0, _pixel(events), events.p * elapsed)
     return image.view(events.height, events.width)
@@ -37,10 +35,8 @@ def voxel_grid(events: Events, bins: int) -> Float[Tensor, "bins h w"]:
     """Each polarity split between the two nearest of `bins` instants (E2VID, Rebecq et al. 2019).
 
     t* = (bins - 1) (t - first) / (last - first): the first event is in bin 0 and the last in bin (bins - 1), whatever
-    the window's length. If all events have the same time, they are in bin 0. ValueError for no bins.
+    the window's length. If all events have the same time, they are in bin 0.
     """
-    if bins < 1:
-        raise ValueError(f"voxel_grid: expected at least one bin, got {bins}")
     size = events.height * events.width
     grid = torch.zeros(bins * size, device=events.t.device)
     if len(events):

@@ -121,6 +121,11 @@ def select(events: Events, which: slice | Bool[Tensor, " n"] | Int64[Tensor, " m
     return Events(t, x, y, p, events.height, events.width)
 
 
+def shifted(events: Events, origin_us: int) -> Events:
+    """The same events, with `origin_us` as time 0."""
+    return replace(events, t=events.t - origin_us)
+
+
 def crop(events: Events, top: int, left: int, height: int, width: int) -> Events:
     """Events in a part of the sensor, in coordinates from the part's corner; ValueError if it exceeds the sensor."""
     if not (0 <= top <= top + height <= events.height and 0 <= left <= left + width <= events.width):
@@ -131,27 +136,21 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
     return replace(cut, x=cut.x - left, y=cut.y - top, height=height, width=width)
 
 
-def downscale(
-    events: Events, height: int, width: int, *, keep_rate: bool, sums: Float64[np.ndarray, "h w"] | None = None
-) -> Events:
+def downscale(events: Events, height: int, width: int, *, sums: Float64[np.ndarray, "h w"] | None = None) -> Events:
     """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
 
-    `keep_rate` False keeps every event, as if a coarse pixel's threshold were divided by the number of its fine pixels.
-    True gives the events of one pixel with the same threshold: it fires each time the polarity sum of its fine pixels
-    moves by their mean number, H W / (height width). `sums` are these sums before the first event, 0 by default, and
-    are updated, so that a stream can come in pieces. ValueError for a larger size.
+    A coarse pixel keeps the threshold and the rate of a fine one: it fires each time the polarity sum of its fine
+    pixels moves by their mean number, H W / (height width). `sums` are these sums before the first event, 0 by default,
+    and are updated, so that a stream can come in pieces. ValueError for a larger size.
     """
     if not (0 < height <= events.height and 0 < width <= events.width):
         raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
     y = (events.y.long() * height // events.height).short()
     x = (events.x.long() * width // events.width).short()
-    coarse = replace(events, x=x, y=y, height=height, width=width)
-    if not keep_rate:
-        return coarse
     fine_pixels = events.height * events.width / (height * width)
     sums = np.zeros((height, width)) if sums is None else sums
     fired = torch.from_numpy(_fires(y.numpy(), x.numpy(), events.p.numpy(), sums, fine_pixels))
-    return select(coarse, fired)
+    return select(replace(events, x=x, y=y, height=height, width=width), fired)
 
 
 def concatenate(parts: Sequence[Events]) -> Events:

@@ -1,7 +1,6 @@
 """Windows of events: those between the frames of a sequence, and those cut from a stream as it arrives."""
 
 import itertools
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -52,52 +51,33 @@ def join_windows(windows: Sequence[EventWindow]) -> EventWindow:
 
 @dataclass(frozen=True)
 class WindowRule:
-    """Length of the windows, and the step between their ends. Exactly one of `length_us` and `events` is given."""
+    """Length of the windows, and the step between their ends."""
 
-    length_us: int | None
-    events: int | None
-    """Number of events in the four channels together."""
+    length_us: int
     step_us: int | None
-    """Time from one window's end to the next; None: each window begins at the end of the previous window."""
+    """None: each window begins at the end of the previous window."""
 
     def __post_init__(self):
-        if (self.length_us is None) == (self.events is None):
-            raise ValueError(f"expected windows of a time or of a number of events, got {self}")
-        if self.length_us is not None and self.length_us < SHORTEST_STEP_US:
+        if self.length_us < SHORTEST_STEP_US:
             raise ValueError(f"expected windows of at least {SHORTEST_STEP_US} us, got {self.length_us}")
-        if self.events is not None and self.events < 2:
-            raise ValueError(f"expected windows of at least 2 events, got {self.events}")
         if self.step_us is not None:
             if self.step_us < SHORTEST_STEP_US:
                 raise ValueError(f"expected a step of at least {SHORTEST_STEP_US / 1000} ms, got {self.step_us} us")
-            if self.length_us is not None and self.step_us > self.length_us:
+            if self.step_us > self.length_us:
                 expected = f"a step no longer than the windows of {self.length_us} us"
                 raise ValueError(f"expected {expected}, got {self.step_us} us: events between windows would be lost")
-
-
-def parse_window(text: str) -> tuple[int | None, int | None]:
-    """Parse "33.3ms" to (microseconds, None), or "20000ev" to (None, number); ValueError for anything else."""
-    if match := re.fullmatch(r"(\d+)\s*ev(ents)?", text.strip()):
-        return None, int(match[1])
-    if match := re.fullmatch(r"(\d+\.?\d*|\.\d+)\s*(us|ms|s)", text.strip()):
-        return round(float(match[1]) * {"us": 1, "ms": 1_000, "s": 1_000_000}[match[2]]), None
-    raise ValueError(f"expected a time such as 33.3ms or a number of events such as 20000ev, got {text!r}")
 
 
 class WindowCutter:
     """Cuts a stream that arrives in pieces into windows, each as soon as all of its events are known.
 
-    Windows by time end after one whole length, and then every step (or length). Windows by number end with their last
-    event and start at the previous window's end; with a step, each holds the last `events` events before a multiple of
-    the step, and starts with the first of them. Times count from 0.
+    The first window ends after one whole length, the others every step (or length). Times count from 0.
     """
 
     def __init__(self, rule: WindowRule, height: int, width: int, channels: int = 4):
         self.rule = rule
         self._held = [Events.empty(height, width)] * channels
-        self._step_us = rule.step_us or rule.length_us
-        self._next_us = rule.length_us or rule.step_us or 0
-        self._start_us = 0
+        self._next_us = rule.length_us
         self._until_us = 0
 
     def add(self, channels: Sequence[Events], until_us: int) -> Iterator[EventWindow]:
@@ -110,10 +90,7 @@ class WindowCutter:
             raise ValueError(f"expected the events of {len(self._held)} channels, got {len(channels)} channels")
         self._check_pauses(channels, until_us)
         self._held = [concatenate([held, new]) for held, new in zip(self._held, channels, strict=True)]
-        if self._step_us is not None:
-            return self._at_steps(self._step_us, until_us)
-        assert self.rule.events is not None
-        return self._by_number(self.rule.events, until_us)
+        return self._complete(until_us)
 
     def _check_pauses(self, channels: Sequence[Events], until_us: int) -> None:
         start_us, self._until_us = self._until_us, until_us
@@ -128,44 +105,17 @@ class WindowCutter:
                 f"{start_us} and {stop_us} us: a damaged time stamp? cut the recording there"
             )
 
-    def _at_steps(self, step_us: int, until_us: int) -> Iterator[EventWindow]:
+    def _complete(self, until_us: int) -> Iterator[EventWindow]:
         while self._next_us <= until_us:
-            start_us = self._start_of_window(self._next_us)
-            if start_us is not None:
-                self._forget(self._places(start_us))
-                yield self._window(start_us, self._next_us, self._places(self._next_us))
-            self._next_us += step_us
+            start_us = self._next_us - self.rule.length_us
+            self._held = [slice_count(held, place, len(held)) for held, place in self._places(start_us)]
+            channels = [slice_count(held, 0, place) for held, place in self._places(self._next_us)]
+            yield EventWindow(channels, start_us, self._next_us)
+            self._next_us += self.rule.step_us or self.rule.length_us
 
-    def _start_of_window(self, stop_us: int) -> int | None:
-        """Start of the window that ends at `stop_us`; None if too few events came before."""
-        if self.rule.events is None:
-            return stop_us - (self.rule.length_us or 0)
-        times = torch.cat([held.t[:n] for held, n in zip(self._held, self._places(stop_us), strict=True)])
-        surplus = len(times) - self.rule.events
-        return int(times.kthvalue(surplus + 1).values) if surplus >= 0 else None
-
-    def _by_number(self, count: int, until_us: int) -> Iterator[EventWindow]:
-        known = self._places(until_us)
-        times = torch.cat([held.t[:n] for held, n in zip(self._held, known, strict=True)]).sort().values
-        used = 0
-        while used + count <= len(times):
-            stop_us = int(times[used + count - 1]) + 1  # all events at this time belong to the window
-            stops = self._places(stop_us)
-            window = self._window(self._start_us, stop_us, stops)
-            used += sum(stops)
-            self._forget(stops)
-            self._start_us = stop_us
-            yield window
-
-    def _places(self, t_us: int) -> list[int]:
-        return [int(torch.searchsorted(held.t, t_us)) for held in self._held]
-
-    def _window(self, start_us: int, stop_us: int, stops: Sequence[int]) -> EventWindow:
-        channels = [slice_count(held, 0, stop) for held, stop in zip(self._held, stops, strict=True)]
-        return EventWindow(channels, start_us, stop_us)
-
-    def _forget(self, places: Sequence[int]) -> None:
-        self._held = [slice_count(held, place, len(held)) for held, place in zip(self._held, places, strict=True)]
+    def _places(self, t_us: int) -> list[tuple[Events, int]]:
+        """The held events of each channel, and their number before a time."""
+        return [(held, int(torch.searchsorted(held.t, t_us))) for held in self._held]
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:

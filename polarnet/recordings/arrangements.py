@@ -1,21 +1,20 @@
-"""Turn files of any polarizer arrangement into four channels on one clock, whole or in pieces of constant memory.
+"""Opens four files (one a polarizer), one file with a mosaic, or one without polarizers, as channels in pieces.
 
-An arrangement is either four files of cameras on one clock, one per angle and in any order, or one file of a camera
-with a mosaic of polarizers on its pixels (division of focal plane). `polarnet.captures.targets` handles
-division-of-time captures, each with its own clock.
+The four files share one clock. A piece has bounded length, so memory does not grow with the files.
+`polarnet.captures.targets` handles division-of-time captures, each with its own clock.
 """
 
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, slice_count
+from polarnet.events.stream import Events, shifted, slice_count
 from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -146,8 +145,3 @@ def open_plain(path: Path, open_file: Open = open_recording) -> Channels:
     """One channel in pieces: all events of a camera without polarizers."""
     reader = open_file(path)
     return Channels(reader.height, reader.width, lambda: ([events] for events in reader), [reader], number=1)
-
-
-def shifted(events: Events, origin_us: int) -> Events:
-    """The same events, with `origin_us` as time 0."""
-    return replace(events, t=events.t - origin_us)

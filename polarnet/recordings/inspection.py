@@ -4,10 +4,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Int64, UInt16
+from jaxtyping import Bool, Int64
 
 from polarnet.events.stream import Events
-from polarnet.recordings.formats.celex5 import celex5_pictures
 from polarnet.recordings.noise import hot_pixels
 from polarnet.recordings.recording import FORMATS, RecordingReader
 from polarnet.recordings.source import REPAIRS
@@ -36,9 +35,6 @@ class Inspection:
     """The longest time without events."""
     gap_start_us: int = 0
     repairs: Mapping[str, int] = field(default_factory=dict)
-    pictures: int = 0
-    """Number of full pictures between events, or in a file without events."""
-    first_picture: UInt16[np.ndarray, "h w"] | None = None
 
     @property
     def events(self) -> int:
@@ -46,11 +42,8 @@ class Inspection:
         return int(self.counts.sum())
 
 
-def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) -> Inspection:
-    """Read a recording once, in memory that does not grow with it.
-
-    `hot_pixel_factor` is the `factor` of `polarnet.recordings.noise.hot_pixels`. RecordingError if reading fails.
-    """
+def inspect_recording(reader: RecordingReader) -> Inspection:
+    """Read a recording once, in memory that does not grow with it; RecordingError if reading fails."""
     shape = reader.height, reader.width
     one = Inspection(reader.format, np.zeros(shape, np.int64), np.zeros(shape, np.bool_), Events.empty(*shape))
     size, least = max(1, round(EVENTS_PER_PIXEL * one.counts.size)), (True, np.inf)
@@ -68,11 +61,7 @@ def inspect_recording(reader: RecordingReader, hot_pixel_factor: float | int) ->
         duration = (first == one.start_us or len(events) < size, last - first)
         if duration < least or not len(one.busiest):
             one.busiest, least = events, duration
-    if reader.format == "celex5_bin":
-        for picture in celex5_pictures(reader.path):
-            one.first_picture = picture.intensity if one.pictures == 0 else one.first_picture
-            one.pictures += 1
-    one.hot = hot_pixels(one.counts, (one.stop_us - one.start_us) * 1e-6, hot_pixel_factor)
+    one.hot = hot_pixels(one.counts, (one.stop_us - one.start_us) * 1e-6)
     one.repairs = {kind: count for kind, count in reader.repairs.items() if count}
     return one
 
@@ -95,8 +84,6 @@ def findings(inspection: Inspection) -> Iterator[str]:
     height, width = inspection.counts.shape
     yield f"format      {inspection.format}: {FORMATS[inspection.format].words}"
     yield f"sensor      {height} x {width} px (height x width)"
-    if inspection.pictures:
-        yield f"pictures    {inspection.pictures}"
     on, off = inspection.on, inspection.events - inspection.on
     yield f"events      {inspection.events:,}: {on:,} ON, {off:,} OFF"
     seconds = (inspection.stop_us - inspection.start_us) / 1e6
@@ -105,10 +92,10 @@ def findings(inspection: Inspection) -> Iterator[str]:
     if seconds > 0:
         t, count = inspection.busiest.t, len(inspection.busiest)
         busiest_us = max(1, int(t[-1] - t[0]))
-        yield f"rate        {_rate(on / seconds)} ON, {_rate(off / seconds)} OFF"
+        yield f"rate        {on / seconds / 1000:,.2f} kev/s ON, {off / seconds / 1000:,.2f} kev/s OFF"
         yield (
             f"busiest     {count:,} events in {busiest_us / 1000:,.1f} ms from {int(t[0]):,} us, "
-            f"{_rate(count / busiest_us * 1e6)}"
+            f"{1000 * count / busiest_us:,.2f} kev/s"
         )
         yield f"gap         at most {inspection.gap_us:,} us without events from {inspection.gap_start_us:,} us"
         if empty := int((inspection.counts.sum(axis=1) == 0).sum()):
@@ -121,13 +108,6 @@ def findings(inspection: Inspection) -> Iterator[str]:
         yield f"repaired    {count:,} {REPAIRS[kind]}"
     if not repairs:
         yield "repaired    nothing"
-
-
-def _rate(rate_hz: float) -> str:
-    for unit, name in ((1e6, "M"), (1e3, "k")):
-        if rate_hz >= unit:
-            return f"{rate_hz / unit:.2f} {name}ev/s"
-    return f"{rate_hz:.1f} ev/s"
 
 
 def _hot(inspection: Inspection) -> str:

@@ -1,4 +1,4 @@
-"""Read events as a camera delivers them: lines of text from standard input or from a file that grows, or a camera.
+"""Read events as a camera delivers them: lines of text from standard input or a file, or a camera itself.
 
 The first line is `width height` of the sensor. Each other line is an event: `t x y p angle`, separated by blanks or
 commas; t in whole microseconds, p 1 or 0 (or -1), angle the polarizer's, 0, 45, 90 or 135. A camera with a mosaic of
@@ -87,16 +87,16 @@ class _Stream:
 
 
 class LiveLines:
-    """Read lines as they arrive, in pieces; ends with the input, or once a file has not grown for `idle_s`.
+    """Read lines as they arrive, in pieces; ends with the input.
 
     Unusable lines and events with wrong times are left out and counted in `counts`. RecordingError where more than 1 %
     of the lines (and 8) are unusable for the same reason, or where the first line is not a size. The source is closed
     at its end, unless it is standard input.
     """
 
-    def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None, idle_s: float):
+    def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None):
         self.name = name
-        self._source, self._idle_s, self._columns = source, idle_s, 4 if mosaic else 5
+        self._source, self._columns = source, 4 if mosaic else 5
         self.waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
         self._queue: Queue[tuple[bytes, float] | None] = Queue(
             MAX_READ_AHEAD // (READ_BYTES if self.waits else PIPE_BYTES)
@@ -166,17 +166,9 @@ class LiveLines:
 
     def _read(self, descriptor: int) -> None:
         """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
-        quiet_since = time.monotonic()
         try:
-            while not self._source.closed:
-                data = os.read(descriptor, READ_BYTES)  # returns the data available, without waiting for more
-                if data:
-                    self._queue.put((data, time.perf_counter()))
-                    quiet_since = time.monotonic()
-                elif not self.waits or time.monotonic() - quiet_since > self._idle_s:
-                    return
-                else:
-                    time.sleep(POLL_S)
+            while not self._source.closed and (data := os.read(descriptor, READ_BYTES)):  # the data available
+                self._queue.put((data, time.perf_counter()))
         except OSError:  # the other end was closed
             return
         finally:

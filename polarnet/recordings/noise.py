@@ -22,7 +22,7 @@ FOUND = "found"
 NEVER = np.iinfo(np.int64).min // 2
 
 NEIGHBOURHOOD = 5  # side of a square, in pixels
-HOT_FACTOR = 4.0  # default of the commands
+HOT_FACTOR = 4.0
 MIN_HOT_HZ = 20.0  # slower pixels are harmless in a scene
 MIN_EVENTS = 8  # fewer events are no evidence
 
@@ -32,8 +32,6 @@ class Cleaning(NamedTuple):
 
     hot: str | None
     """File with a line `x y` for each hot pixel of the sensor; `FOUND`: detect hot pixels; None: keep them."""
-    hot_factor: float
-    """A pixel is found to be hot above this multiple of the third busiest of the 5 x 5 pixels around it."""
     background_us: int | None
     """Time before an event in which one of the 8 pixels around it must fire, else it is removed; None: no removal."""
 
@@ -89,7 +87,7 @@ class Cleaner:
             new = list(map(event_counts, piece.channels))
             counts = list(map(np.add, counts, new)) if counts else new
             duration_us = piece.until_us
-        return [hot_pixels(one, duration_us * 1e-6, self._cleaning.hot_factor) for one in counts]
+        return [hot_pixels(one, duration_us * 1e-6) for one in counts]
 
     def _listed(self, events: Events, channel: int) -> Bool[np.ndarray, "h w"]:
         """Hot pixels of a channel in the user's list."""
@@ -111,7 +109,7 @@ def event_counts(events: Events) -> Int[np.ndarray, "h w"]:
 
 
 def hot_pixels(
-    counts: Int[np.ndarray, "h w"], duration_s: float, factor: float | int, min_hz: float = MIN_HOT_HZ
+    counts: Int[np.ndarray, "h w"], duration_s: float, factor: float | int = HOT_FACTOR, min_hz: float = MIN_HOT_HZ
 ) -> Bool[np.ndarray, "h w"]:
     """Pixels that fired more than `factor` times as often as the third busiest of the 5x5 pixels around them.
 

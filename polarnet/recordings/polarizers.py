@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from polarnet.events.stream import slice_time
-from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
+from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow, WindowCutter, WindowRule
 from polarnet.recordings.arrangements import Piece
-from polarnet.recordings.noise import HOT_FACTOR, event_counts, hot_pixels, without_pixels
+from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
 
-WINDOW_US = 33_333
 WINDOWS = 30  # the first second
 BLOCK = 4  # pixels, square; single pixels have too few events to compare
 MIN_BLOCKS = 1000  # blocks with events: the ratio of two misfits is then known to about 1 / sqrt(1000), 3 %
@@ -42,7 +41,7 @@ class ChannelCheck:
         self.counts = [0, 0, 0, 0]
         """Number of events in each channel."""
         self._mosaic = mosaic
-        self._cutter = WindowCutter(WindowRule(WINDOW_US, None, None), height, width)
+        self._cutter = WindowCutter(WindowRule(TRAINED_WINDOW_US, None), height, width)
         self._windows: list[EventWindow] = []
 
     def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
@@ -50,16 +49,16 @@ class ChannelCheck:
         for piece in pieces:
             self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
             if len(self._windows) < WINDOWS:
-                end_us = WINDOWS * WINDOW_US
+                end_us = WINDOWS * TRAINED_WINDOW_US
                 early = [slice_time(events, 0, end_us) for events in piece.channels]
                 self._windows += self._cutter.add(early, min(piece.until_us, end_us))
             yield piece
 
     def findings(self) -> list[str]:
         """Problems found, a sentence each; empty if there are none, or too few events to judge."""
-        seconds = len(self._windows) * WINDOW_US * 1e-6
+        seconds = len(self._windows) * TRAINED_WINDOW_US * 1e-6
         counts = np.sum([[event_counts(e) for e in window.channels] for window in self._windows] or [[]], axis=0)
-        hot = [hot_pixels(count, seconds, HOT_FACTOR) for count in counts]
+        hot = [hot_pixels(count, seconds) for count in counts]
         findings = _channel_findings(*pair_misfits(self._windows, hot), self.counts, self._mosaic)
         if disturbing := sum(
             int((bad & (n > DISTURBING_HZ * seconds)).sum()) for n, bad in zip(counts, hot, strict=True)

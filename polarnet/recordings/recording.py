@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from polarnet.events.stream import MAX_SIDE, Events
+from polarnet.events.stream import Events
 from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import (
@@ -44,8 +44,8 @@ class Format(NamedTuple):
     open: Callable[[Path, Choices], Source]
     frames: Callable[[Path], CameraFrames] | None = None
     """Read the frames that the camera recorded beside its events; None for formats without frames."""
-    takes: tuple[str, ...] = ()
-    """Choices that have a meaning for the format, beside height and width: `part`, `clock_mhz`."""
+    parts: bool = False
+    """Whether a file can hold several recordings, of which `part` names one."""
 
 
 def signature(start: bytes) -> Callable[[Path, bytes], bool]:
@@ -53,37 +53,35 @@ def signature(start: bytes) -> Callable[[Path, bytes], bool]:
     return lambda path, head: head.startswith(start)
 
 
-PART, CLOCK = ("part",), ("clock_mhz",)
 FORMATS = {
     **{
         name: Format(
             f"HDF5 of {layout.owner}",
-            hdf5.matcher(name),
-            hdf5.opener(name),
+            partial(hdf5.matches, layout),
+            partial(hdf5.open_hdf5, layout),
             hdf5.e2p_frames if name == "e2p" else None,
-            takes=PART if len(layout.parts) > 1 else (),
+            parts=len(layout.parts) > 1,
         )
         for name, layout in hdf5.LAYOUTS.items()
     },
-    "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, takes=PART),
+    "rosbag": Format("bags of ROS 1 and ROS 2", rosbag.matches, rosbag.open_rosbag, parts=True),
     "aedat4": Format(
         "AEDAT4 of iniVation",
         signature(b"#!AER-DAT4"),
         partial(faery.open_faery, aedat4=True),
         faery.aedat4_frames,
-        PART,
+        parts=True,
     ),
-    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, takes=PART),
+    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, parts=True),
     "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
     "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), partial(faery.open_faery, aedat4=False)),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),
-    "celex5_csv": Format("CSV of a CeleX-5", celex5.matches_csv, celex5.open_csv, takes=CLOCK),
-    "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin, takes=CLOCK),
+    "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin),
 }
 """Ordered as they are tried on a file of unknown format."""
-PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_csv", "celex5_bin")
+PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_bin")
 """Formats that are read from gzip and zip archives too."""
 
 
@@ -98,25 +96,24 @@ class Recording:
 
 
 class RecordingReader:
-    """Yields a file's events in chunks of `chunk_events` (the last may be shorter); made by `open_recording`.
+    """Yields a file's events in chunks, of which the last may be shorter; made by `open_recording`.
 
     Iterating reads the file from its start in constant memory, and raises RecordingError where the file turns out to be
     damaged. `repairs` counts the repairs up to the latest chunk.
     """
 
-    def __init__(self, path: Path, form: str, blocks: Blocks, sensor: tuple[int, int], chunk_events: int):
+    def __init__(self, path: Path, form: str, blocks: Blocks, sensor: tuple[int, int]):
         self.path = path
         self.format = form
         self.height, self.width = sensor
         self.repairs = Counts()
         self._blocks = blocks
-        self._chunk_events = chunk_events
 
     def __iter__(self) -> Iterator[Events]:
-        return self.chunks(self._chunk_events)
+        return self.chunks()
 
     def chunks(self, size: int = CHUNK_EVENTS, bridged_us: int = 0) -> Iterator[Events]:
-        """Iterate with another number of events in a chunk.
+        """Iterate with `size` events in a chunk.
 
         A clock that was set anew in the first `bridged_us` is no error: events go on 10 ms after the newest one.
         """
@@ -135,41 +132,28 @@ def open_recording(
     height: int | None = None,
     width: int | None = None,
     part: str | None = None,
-    clock_mhz: float | int | None = None,
-    chunk_events: int = CHUNK_EVENTS,
 ) -> RecordingReader:
     """Open a file to read it chunk by chunk.
 
     `format` is a key of FORMATS; None detects it from the content. `height` and `width` are needed where the file does
     not state them. `part` is one of several recordings in a file: a topic of a bag, a stream of AEDAT, `left` or
-    `right` of M3ED and MVSEC. `clock_mhz` is the clock of a CeleX-5 whose file holds clock
-    ticks. RecordingError where the format is unknown, has no parts or the content cannot be events; RuntimeError naming
-    the package to install where an optional one is missing.
+    `right` of M3ED and MVSEC. RecordingError where the format is unknown, has no parts or the content cannot be events;
+    RuntimeError naming the package to install where an optional one is missing.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    for name, side in (("height", height), ("width", width)):
-        if side is not None and not 0 < side <= MAX_SIDE:
-            raise ValueError(f"expected a {name} of 1 to {MAX_SIDE} px, got {side}")
-    if chunk_events < 1:
-        raise ValueError(f"expected at least one event in a chunk, got {chunk_events}")
-    if clock_mhz is not None and not 0.001 <= clock_mhz <= 10_000:
-        raise ValueError(f"expected a clock of 0.001 to 10000 MHz, got {clock_mhz}")
-    choices = Choices(height, width, part, clock_mhz)
+    choices = Choices(height, width, part)
     form = detect_format(path) if format is None else format
     if form not in FORMATS:
         raise ValueError(f"expected a format of {', '.join(FORMATS)}, got {form!r}")
-    for name in {"part", "clock_mhz"} - {*FORMATS[form].takes}:
-        if getattr(choices, name) is not None:
-            raise RecordingError(
-                f"{path.name}: expected no {name}, which has no meaning for the format {form}; leave it out"
-            )
+    if part is not None and not FORMATS[form].parts:
+        raise RecordingError(f"{path.name}: expected no part, which has no meaning for the format {form}; leave it out")
     if form not in PACKABLE and path.is_file() and _packed(path):
         raise RecordingError(f"{path.name}: expected the format {form} outside an archive; unpack it")
     source = FORMATS[form].open(path, choices)
     sensor = sensor_size(path, choices, source.height, source.width)
-    return RecordingReader(path, form, source.blocks, sensor, chunk_events)
+    return RecordingReader(path, form, source.blocks, sensor)
 
 
 def read_recording(
@@ -179,7 +163,6 @@ def read_recording(
     height: int | None = None,
     width: int | None = None,
     part: str | None = None,
-    clock_mhz: float | int | None = None,
 ) -> Recording:
     """Read a whole file, with the arguments and errors of `open_recording`; logs a warning for each kind of damage.
 
@@ -189,7 +172,7 @@ def read_recording(
     >>> read_recording("night.txt").events.x
     tensor([3], dtype=torch.int16)
     """
-    reader = open_recording(path, format, height=height, width=width, part=part, clock_mhz=clock_mhz)
+    reader = open_recording(path, format, height=height, width=width, part=part)
     (events,) = whole(([chunk] for chunk in reader), reader.height, reader.width, 1)
     log_repairs(reader)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})

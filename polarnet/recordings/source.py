@@ -85,8 +85,6 @@ class Choices:
     width: int | None = None
     part: str | None = None
     """A topic of a bag, a stream of AEDAT, or a camera of a file with two."""
-    clock_mhz: float | int | None = None
-    """Clock of a CeleX-5; None: 100 MHz in a BIN file, and times in microseconds in a CSV file."""
 
 
 Blocks = Callable[[Counts], Iterator[Block]]

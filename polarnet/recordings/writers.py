@@ -5,7 +5,6 @@
 
 import io
 import itertools
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -33,11 +32,11 @@ Recorded: TypeAlias = Events | Iterable[Events]
 """Events of one sensor, or consecutive chunks of them, at least one."""
 
 
-def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int | None) -> None:
+def write_hdf5(path: str | os.PathLike[str], events: Recorded) -> None:
     """Write one channel in DSEC's layout of a camera (Gehrig et al. 2021): events/{x,y,t,p}, ms_to_idx and t_offset.
 
     Polarity is 1 or 0 there; t is int64, because DSEC's uint32 ends after 71 minutes. The attributes height and width
-    add the sensor's size. `duration_us` None: up to the last event. ValueError for more than 30 days. Needs h5py.
+    add the sensor's size. ValueError for more than 30 days. Needs h5py.
     """
     with _Disk(path, "wb+") as disk, h5py_module().File(disk, "w") as file:
         columns = {
@@ -46,22 +45,20 @@ def write_hdf5(path: str | os.PathLike[str], events: Recorded, duration_us: int 
         }
         index = _growing(file, "ms_to_idx", np.uint64)
         file["t_offset"] = np.int64(0)
-        end_us, count = 0, 0
+        count = 0
         for block in _blocks(events, "HDF5", MAX_DURATION_US):
             file.attrs["height"], file.attrs["width"] = block.height, block.width
             t = block.t.numpy()
             for name, dataset in columns.items():
                 values = (block.p > 0).numpy() if name == "p" else getattr(block, name).numpy()
                 _append(dataset, values.astype(dataset.dtype))
-            if len(t):
-                end_us = int(t[-1])
-                for edges in _milliseconds(len(index), end_us // 1000 + 1):
-                    _append(index, (count + np.searchsorted(t, 1000 * edges)).astype(np.uint64))
+            stop_ms = int(t[-1]) // 1000 + 1 if len(t) else 0
+            for first in range(len(index), stop_ms, BLOCK):
+                edges_us = 1000 * np.arange(first, min(first + BLOCK, stop_ms))
+                _append(index, (count + np.searchsorted(t, edges_us)).astype(np.uint64))
             count += len(t)
             disk.check()
-        end_us = end_us + 1 if duration_us is None else duration_us
-        for edges in _milliseconds(len(index), -(-end_us // 1000) + 1):  # up to the first at or after the end
-            _append(index, np.full(len(edges), count, np.uint64))
+        _append(index, np.array([count], np.uint64))
     disk.check()
 
 
@@ -105,16 +102,10 @@ def _append(dataset: Any, values: np.ndarray) -> None:
     dataset[len(dataset) - len(values) :] = values
 
 
-def _milliseconds(start: int, stop: int) -> Iterator[np.ndarray]:
-    """Whole milliseconds, in blocks."""
-    for first in range(start, stop, BLOCK):
-        yield np.arange(first, min(first + BLOCK, stop))
-
-
-def write_text(path: str | os.PathLike[str], events: Recorded, duration_us: int | None) -> None:
+def write_text(path: str | os.PathLike[str], events: Recorded) -> None:
     """Write one channel as a line `width height`, then a line `t x y p` per event, the format of E2VID's tools.
 
-    t is in seconds with six decimals; p is 1 or 0. Such a file cannot hold the duration.
+    t is in seconds with six decimals; p is 1 or 0.
     """
     text = np.empty(MAX_LINE * BLOCK, np.uint8)
     with Path(path).open("wb") as file:
@@ -124,11 +115,10 @@ def write_text(path: str | os.PathLike[str], events: Recorded, duration_us: int 
             file.write(text[: _encode_text(*(getattr(block, name).numpy() for name in "txyp"), text)].data)
 
 
-def write_evt3(path: str | os.PathLike[str], events: Recorded, duration_us: int | None) -> None:
+def write_evt3(path: str | os.PathLike[str], events: Recorded) -> None:
     """Write one sensor as Prophesee's raw file of 16-bit EVT3 words, without vector words (of neighbouring pixels).
 
-    The header states the sensor's size. Such a file cannot hold the duration. ValueError for a side above 2048 px, and
-    for more than 30 days.
+    The header states the sensor's size. ValueError for a side above 2048 px, and for more than 30 days.
     """
     state = np.array([-1, -1, -1])  # high and low bits of the time, and row, of the event before
     words = np.empty(EVT3_WORDS, np.uint16)
@@ -227,7 +217,7 @@ def _encode_evt3(t, x, y, p, start, state, words):
     return len(t), n
 
 
-FORMS: dict[str, tuple[str, Callable[[Path, Recorded, int | None], None]]] = {
+FORMS: dict[str, tuple[str, Callable[[Path, Recorded], None]]] = {
     "hdf5": (".h5", write_hdf5),
     "text": (".txt", write_text),
     "evt3": (".raw", write_evt3),
@@ -235,16 +225,12 @@ FORMS: dict[str, tuple[str, Callable[[Path, Recorded, int | None], None]]] = {
 """Suffix and writer of each file format."""
 
 
-EXPORT_INDEX = "store.json"
-
-
 def export_store(
     store: EventStore, folder: str | os.PathLike[str], form: str, sequences: Sequence[str] | None = None
 ) -> None:
-    """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence, then FOLDER/store.json.
+    """Write FOLDER/SEQUENCE/polarizer_{000,045,090,135}.{h5,txt,raw} for every sequence.
 
-    `sequences` are those to write; None: all. `form` is hdf5, text or evt3. store.json holds the data that these files
-    cannot: durations, sizes, attributes.
+    `sequences` are those to write; None: all. `form` is hdf5, text or evt3. ValueError for an unknown sequence.
     """
     folder = Path(folder)
     if form not in FORMS:
@@ -252,29 +238,16 @@ def export_store(
     suffix, write = FORMS[form]
     chosen = store.sequences if sequences is None else sequences
     for sequence in ProgressBar(chosen, "export", unit="sequence"):
-        if Path(sequence).name != sequence:
-            raise ValueError(f"{store.path}: {sequence!r} cannot be the name of a folder")
-        duration_us = store.duration_us(sequence)
+        offsets = store.record(sequence)["offsets"]
         (folder / sequence).mkdir(parents=True, exist_ok=True)
         for channel, angle in enumerate(POLARIZER_ANGLES_DEG):
             path = folder / sequence / f"polarizer_{angle:03d}{suffix}"
             nothing = Events.empty(store.height, store.width)  # so that a channel without events has a size
-            write(path, itertools.chain([nothing], _channel_chunks(store, sequence, channel)), duration_us)
-    contents = {
-        "form": form,
-        "height": store.height,
-        "width": store.width,
-        "polarizer_angles_deg": POLARIZER_ANGLES_DEG,
-        "sequences_per_part": store.sequences_per_part,
-        "duration_us": {sequence: store.duration_us(sequence) for sequence in chosen},
-        "attributes": store.attributes,
-    }
-    (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+            write(path, itertools.chain([nothing], _chunks(store, sequence, *offsets[channel : channel + 2])))
 
 
-def _channel_chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:
-    """The events of one channel of a sequence, in chunks."""
-    first, end = store.record(sequence)["offsets"][channel : channel + 2]
+def _chunks(store: EventStore, sequence: str, first: int, end: int) -> Iterator[Events]:
+    """Consecutive events of a sequence, in chunks."""
     for start in range(first, end, BLOCK):
         yield from store.rows(sequence, [(start, min(start + BLOCK, end))])
 

@@ -23,7 +23,6 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
-from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
@@ -97,7 +96,7 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
 
 
 def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
-    """Read live from standard input (-), a growing file or a camera (dv://...), until `idle_s` seconds without data.
+    """Read live from standard input (-), a file, or a camera (dv://...), which ends after `idle_s` without an event.
 
     ValueError for a camera without a mosaic.
     """
@@ -107,9 +106,9 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -
             raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
         reader = LiveCamera(path, mosaic, idle_s)
     elif path == STANDARD_INPUT:
-        reader = LiveLines(sys.stdin.buffer, "standard input", mosaic, idle_s)
+        reader = LiveLines(sys.stdin.buffer, "standard input", mosaic)
     elif Path(path).is_file():
-        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic, idle_s)  # noqa: SIM115 - read until the end
+        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic)  # noqa: SIM115 - read until the end
     else:
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
     pieces = clean.clean(reader, live=True)
@@ -134,7 +133,7 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
 
 def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule:
     """Consecutive windows of `step_us` (default: half a turn)."""
-    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None, None)
+    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
 
 
 def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
@@ -149,7 +148,7 @@ def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Ite
     """Pieces with the fewer pixels of `sums`, see `downscale`."""
     for piece in pieces:
         both = zip(piece.channels, sums, strict=True)
-        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
+        yield piece._replace(channels=[downscale(e, *own.shape, sums=own) for e, own in both])
 
 
 def _channels(files: Files, work: Path) -> Channels:
@@ -192,8 +191,7 @@ def _stored(store: EventStore, sequence: str) -> Channels:
 
 def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
     """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
-    if (folder / EXPORT_INDEX).is_file():
-        names = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    if names := sorted({path.parent.name for path in folder.glob(f"*/polarizer_{POLARIZER_ANGLES_DEG[0]:03d}.*")}):
         folder = folder / _named(sequence, names, folder.name)
     files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
     if not all(files.values()):

@@ -274,13 +274,12 @@ def recover(
                 more["joined"] = f"{joined[0]} windows"
             bar.set_postfix(frames=len(step_ms), step=f"{step_ms[-1]:.1f} ms", refresh=False, **more)
     run_s, stream_s = time.perf_counter() - started, last_us * 1e-6
-    length = f"{rule.length_us / 1000:g} ms" if rule.length_us is not None else f"{rule.events:,} events"
     step = "one after the other" if rule.step_us is None else f"one every {rule.step_us / 1000:g} ms"
     facts = {
         "input": source.name,
         "size": f"{source.height} x {source.width} px",
         "method": words,
-        "windows": f"of {length}, {step}",
+        "windows": f"of {rule.length_us / 1000:g} ms, {step}",
         "frames": f"{len(step_ms):,} of {stream_s:.3f} s",
         "step": f"{statistics.median(step_ms):.2f} ms (median)",
     }
@@ -295,8 +294,6 @@ def recover(
 
 def _too_short(source: Input, rule: WindowRule, duration_us: int) -> str:
     """Error message for an input shorter than one window, with advice."""
-    if rule.length_us is None:
-        return f"{source.name} ends before {rule.events:,} events, one window: record for longer, or give fewer events"
     lasts = (
         f"{source.name} lasts {duration_us / 1000:g} ms, less than one window of {rule.length_us / 1000:g} ms: record "
         f"for longer"

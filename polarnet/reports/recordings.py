@@ -13,7 +13,6 @@ from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, Recordings
 from polarnet.captures.targets import Calibrated
 from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.stream import Events, slice_time
-from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.inspection import Inspection
 from polarnet.reports.figures import LIGHT, show_picture, tile_grid
 from polarnet.reports.maps import (
@@ -34,9 +33,7 @@ SPAN_MS = 60.0  # on each side of the start
 
 
 def recording_picture(inspection: Inspection) -> bytes:
-    """A PNG of the busiest events without hot pixels, ON red and OFF blue; without events, the first full picture."""
-    if inspection.events == 0 and inspection.first_picture is not None:
-        return encode_png(intensity_image(torch.from_numpy(inspection.first_picture / np.float32(WHITE))))
+    """A PNG of the busiest events without hot pixels, ON red and OFF blue."""
     signed = polarity_sums(inspection.busiest).masked_fill(torch.from_numpy(inspection.hot), 0.0)
     return encode_png(event_image(signed, event_full_scale(signed)))
 

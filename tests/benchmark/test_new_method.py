@@ -58,6 +58,6 @@ def test_it_needs_no_section_in_the_configuration_and_recover_runs_it(activity, 
     assert config.used_baselines == []
     channels = sequence.events
     source = Input("test", channels[0].height, channels[0].width, [Piece(channels, 4000, 0.0)])
-    frames = list(frames_of(source, WindowRule(1000, None, None), activity.open(make_setup("activity"))))
+    frames = list(frames_of(source, WindowRule(1000, None), activity.open(make_setup("activity"))))
     assert [frame.window.stop_us for frame in frames] == [1000, 2000, 3000, 4000]
     assert frames[-1].prediction.dolp.sum().item() == pytest.approx(4 * 300 * EVENT)

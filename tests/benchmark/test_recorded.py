@@ -11,11 +11,10 @@ from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set
 from polarnet.cli import main
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events, merge
+from polarnet.events.stream import Events, merge, shifted
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png
-from polarnet.recordings.arrangements import shifted
 from polarnet.recordings.noise import Cleaning
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("brief_costs")
 
 pytest.importorskip("h5py")
 
-NOTHING = Cleaning(None, 4.0, None)
+NOTHING = Cleaning(None, None)
 TINY = [
     "ingest.height=100", "ingest.width=150", "synthesize.duration_s=0.2", "synthesize.sensor_height=32",
     "synthesize.sensor_width=44", "benchmark.warmup_windows=1", "benchmark.bootstrap_samples=10",
@@ -137,7 +136,7 @@ def test_hot_pixels_of_a_recording_are_removed_before_it_is_scored(recording, tm
     levels = np.rint(WHITE * truth.light.clip(0, 1)).astype(np.uint8)
     (tmp_path / "in").mkdir()
     write_e2p(tmp_path / "in" / "hot.h5", merge([events, hot]), truth.t_us, levels, None)
-    clean = read_recorded(tmp_path / "in" / "hot.h5", "hot", MOSAIC, Cleaning("found", 4.0, None))
+    clean = read_recorded(tmp_path / "in" / "hot.h5", "hot", MOSAIC, Cleaning("found", None))
     joined = join_mosaic(clean.channels, MOSAIC)
     assert not ((joined.x == 20) & (joined.y == 20)).any()
     (note,) = clean.notes

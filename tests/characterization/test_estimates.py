@@ -8,7 +8,7 @@ import pytest
 from event_fixtures import events_of
 
 from polarnet.characterization.flicker import Flicker, Increments, flicker_cycle, thresholds_without_leak
-from polarnet.characterization.intervals import PixelEvents, by_pixel, intervals_of, undisturbed
+from polarnet.characterization.intervals import undisturbed
 from polarnet.characterization.noise import (
     estimate_noise,
     hot_under_constant_light,
@@ -18,6 +18,7 @@ from polarnet.characterization.noise import (
     rate_swing,
 )
 from polarnet.characterization.thresholds import deviation, pixel_thresholds
+from polarnet.events.intervals import PixelEvents, by_pixel, intervals_of
 from polarnet.simulation.presets import SENSORS
 
 PIXELS = 600

@@ -1,5 +1,6 @@
 """`polarnet convert`."""
 
+import argparse
 import re
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from event_fixtures import events_of
 
 from polarnet.cli import main
+from polarnet.cli.options import duration_us
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.writers import write_text
 
@@ -15,7 +17,7 @@ EVENTS = [(1_000_000, 3, 4, 1), (1_250_000, 5, 6, -1), (1_500_000, 0, 0, 1), (1_
 
 @pytest.fixture
 def recording(tmp_path):
-    write_text(tmp_path / "in.txt", events_of(EVENTS, 8, 9), 2_000_000)
+    write_text(tmp_path / "in.txt", events_of(EVENTS, 8, 9))
     return tmp_path / "in.txt"
 
 
@@ -40,6 +42,18 @@ def test_a_span_is_half_open_and_counts_from_the_first_event(recording, tmp_path
     assert main(["convert", str(recording), str(out), "--start", "1s"]) == 1
     assert "expected events between --start and --stop, there are none" in capsys.readouterr().err
     assert read_recording(out).events.t.tolist() == [0, 250_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "us"), [("33.3ms", 33_300), ("100 us", 100), (".5s", 500_000), ("33", None), ("ms", None), ("-3ms", None)]
+)
+def test_a_time_has_a_unit(text, us):
+    options = argparse.Namespace(stop=text)
+    if us is not None:
+        assert duration_us(options, "stop", "500ms") == us
+        return
+    with pytest.raises(ValueError, match=f"--stop: expected a time such as 500ms, got {text}"):
+        duration_us(options, "stop", "500ms")
 
 
 def test_what_cannot_be_converted_is_refused(recording, tmp_path, capsys):

@@ -50,10 +50,9 @@ def test_the_yaml_written_loads_as_a_sensor_and_a_log_shows_the_progress_of_each
     monkeypatch.setattr("polarnet.terminal.progress.LINE_S", 0.0)
     assert main([*FIT, "--name", "mine", *FLICKER]) == 0
     printed, log = capfd.readouterr()
-    assert {line.split(":")[0] for line in log.splitlines() if "100%" in line} == {"read", "sort", "fit", "twin"}
+    assert {line.split(":")[0] for line in log.splitlines() if "100%" in line} == {"read", "sort", "fit"}
     assert "leak_rate_hz" in printed
     assert "not estimated" in printed
-    assert "flicker: flicker.txt: Twin to recording: event rate" in printed
     written = (folder / "conf" / "sensor" / "mine.yaml").read_text()
     assert "contrast_threshold_on: 0.173" in written  # ln 4 / 8
     assert "contrast_threshold_off: 0.173" in written

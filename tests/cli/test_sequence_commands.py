@@ -34,7 +34,7 @@ def zarr_times(simulated):
 def test_an_exported_sequence_gives_the_frames_of_the_store(simulated, tmp_path):
     pytest.importorskip("h5py")
     assert main(["convert", str(simulated.events), str(tmp_path / "files"), "--sequence", "b-0"]) == 0
-    assert sorted(path.name for path in (tmp_path / "files").iterdir()) == ["b-0", "run.json", "store.json"]
+    assert sorted(path.name for path in (tmp_path / "files").iterdir()) == ["b-0", "run.json"]
     options = ["--write", "zarr", "--method", "highpass", "--sequence", "b-0"]
     for source, out in ((simulated.events, "a"), (tmp_path / "files", "b"), (tmp_path / "files" / "b-0", "c")):
         chosen = options[:-2] if out == "c" else options

@@ -26,7 +26,7 @@ def test_windows_at_once_must_follow_each_other_and_joined_ones_hold_each_event_
     windows = sequence.windows
     with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
         advance(ours, begin(ours, 18, 20), [windows[0], windows[2]])
-    overlapping = windows_of(sequence, WindowRule(WINDOW_US, None, 500))
+    overlapping = windows_of(sequence, WindowRule(WINDOW_US, 500))
     joined = join_windows(overlapping)
     assert (joined.start_us, joined.stop_us, joined.joined) == (0, overlapping[-1].stop_us, len(overlapping))
     for channel, events in zip(joined.channels, sequence.events, strict=True):
@@ -39,7 +39,7 @@ def test_windows_at_once_must_follow_each_other_and_joined_ones_hold_each_event_
 def test_overlapping_windows_continue_those_that_ended_where_they_begin(sequence, ours):
     """Every quarter of a window: the fourth part of the frames is what windows one after the other give."""
     history, frames = begin(ours, 18, 20), {}
-    for window in windows_of(sequence, WindowRule(WINDOW_US, None, 250)):
+    for window in windows_of(sequence, WindowRule(WINDOW_US, 250)):
         history, prediction = advance(ours, history, [window])
         frames[window.stop_us] = prediction.dolp
     for shift_us in (0, 250, 500, 750):
@@ -55,7 +55,7 @@ def test_overlapping_windows_continue_those_that_ended_where_they_begin(sequence
 def test_a_filter_counts_each_event_once_however_windows_overlap(name, step_us, sequence, make_setup):
     recoverer = METHODS[name].open(make_setup(name))
     last = []
-    for rule in (WindowRule(WINDOW_US, None, None), WindowRule(WINDOW_US, None, step_us)):
+    for rule in (WindowRule(WINDOW_US, None), WindowRule(WINDOW_US, step_us)):
         history, prediction = begin(recoverer, 18, 20), None
         for window in windows_of(sequence, rule):
             history, prediction = advance(recoverer, history, [window])
@@ -119,7 +119,7 @@ def test_short_windows_are_joined_long_ones_cut_and_those_of_about_the_trained_l
 
 def test_every_event_counts_once_in_the_series_that_ends_with_a_window_and_windows_may_come_at_once(sequence, ours):
     """Four windows of a quarter: the frames at every whole window are those of whole windows."""
-    any_length, quarters = of_any_length(ours, TRAINED_US), windows_of(sequence, WindowRule(250, None, None))
+    any_length, quarters = of_any_length(ours, TRAINED_US), windows_of(sequence, WindowRule(250, None))
     _, together = any_length.step(any_length.start(18, 20), quarters)
     state, frames = any_length.start(18, 20), []
     for window in quarters:

@@ -115,7 +115,7 @@ def test_a_case_has_the_events_that_it_was_written_with(cases, read, name, recor
 @pytest.mark.parametrize("name", LIVE)
 def test_a_case_goes_on_live(cases, name, record_property):
     with (cases / name).open("rb") as file:
-        live = LiveLines(file, name, ((90, 45), (135, 0)), idle_s=0.0)
+        live = LiveLines(file, name, ((90, 45), (135, 0)))
         events = sum(len(channel) for piece in live for channel in piece.channels)
     repairs = {kind: count for kind, count in live.counts.items() if count}
     record_property("now", f"live {events} events{mended(repairs)}")

@@ -38,12 +38,12 @@ def write_sample(form: str, path: Path, events) -> dict[Path, bytes]:
     return {file: file.read_bytes() for file in sorted([path, *path.rglob("*")]) if file.is_file()}
 
 
-def ending(path: Path, form: str | None, chunk_events: int) -> str:
+def ending(path: Path, form: str | None, size: int) -> str:
     """Whether a file is read, repaired or refused. Whatever else a reader does is raised."""
     try:
-        reader = open_recording(path, form, chunk_events=chunk_events)
+        reader = open_recording(path, form)
         before = None
-        for events in reader:
+        for events in reader.chunks(size):
             validate(events)
             assert before is None or events.t[0] >= before
             before = events.t[-1]
@@ -64,13 +64,13 @@ def test_a_damaged_file_ends_in_events_or_in_the_reason(form, tmp_path, make_ran
 
     @FUZZ
     @given(DAMAGE, st.sampled_from([*sound]), st.booleans(), st.integers(1, 100))
-    def one_case(damage, file, says_format, chunk_events):
+    def one_case(damage, file, says_format, size):
         content = sound[file]
         for place, removed, inserted in damage:
             place %= max(1, len(content))
             content = content[:place] + inserted + content[place + removed :]
         file.write_bytes(content)
-        endings[ending(path, form if says_format else None, chunk_events)] += 1
+        endings[ending(path, form if says_format else None, size)] += 1
         file.write_bytes(sound[file])
 
     one_case()

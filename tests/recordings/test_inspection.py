@@ -14,10 +14,8 @@ from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.noise import Cleaner, Cleaning, hot_pixels, never, read_hot_pixels, without_background
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
+from polarnet.recordings.writers import write_text
 from polarnet.stokes import parse_mosaic
-from studies.celex5_writer import write_celex5_csv, write_celex5_pictures
-
-FACTOR = 4
 
 
 def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_sensor(tmp_path, columns):
@@ -27,17 +25,17 @@ def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_se
     later = [(100_000 + 1000 * k, k % 20, 3, 1) for k in range(30)]
     path = tmp_path / "e.txt"
     path.write_text("20 10\n" + "".join(f"{t} {x} {y} {p}\n" for t, x, y, p in slow + quick + later))
-    inspection = inspect_recording(open_recording(path, chunk_events=7), FACTOR)
+    inspection = inspect_recording(open_recording(path))
     assert columns(inspection.busiest) == [[t for t, *_ in quick], [5] * 30, [7] * 30, [-1] * 30]
     assert "busiest     30 events in 2.9 ms from 50,000 us, 10.34 kev/s" in [*findings(inspection)]
     (tmp_path / "e.txt").write_text("32767 32767\n1 2 3 1\n")
     with pytest.raises(RecordingError, match="expected a sensor of at most 16,777,216 pixels, got 32767x32767"):
-        inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)
+        inspect_recording(open_recording(tmp_path / "e.txt"))
 
 
 def test_findings_say_what_was_repaired_the_empty_rows_and_the_longest_silence(tmp_path):
     (tmp_path / "e.txt").write_text("20 10\n5 2 3 1\n4 2 3 0\n6 2 x 1\n3000000 4 5 1\n")
-    lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR)))
+    lines = "\n".join(findings(inspect_recording(open_recording(tmp_path / "e.txt"))))
     for words in (
         "format      text: lines `t x y p`",
         "sensor      10 x 20 px (height x width)",
@@ -52,7 +50,7 @@ def test_findings_say_what_was_repaired_the_empty_rows_and_the_longest_silence(t
     rows = [0, 1, 2, 5, 7]
     lines = "".join(f"{t} {k % 20} {rows[k % 5]} 1\n" for k, t in enumerate(times))
     (tmp_path / "e.txt").write_text("20 8\n" + lines)
-    lines = [*findings(inspect_recording(open_recording(tmp_path / "e.txt"), FACTOR))]
+    lines = [*findings(inspect_recording(open_recording(tmp_path / "e.txt")))]
     assert "empty rows  3 of 8 without any event" in lines
     assert "gap         at most 40,100 us without events from 299,900 us" in lines
 
@@ -61,23 +59,14 @@ def test_inspect_prints_findings_and_draws_no_hot_pixels(tmp_path, make_events, 
     monkeypatch.chdir(tmp_path)
     edge = make_events([(k, k % 50, 20, 1 - 2 * (k % 2)) for k in range(100)], 800, 1280)
     hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
-    write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
-    assert main(["inspect", "capture.csv"]) == 0
+    write_text(tmp_path / "capture.txt", merge([edge, hot]))
+    assert main(["inspect", "capture.txt"]) == 0
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
-    picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.csv.png"))
+    picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.txt.png"))
     assert picture.shape == (800, 1280, 3)
     coloured = np.argwhere((picture != 255).any(axis=-1))
     assert np.unique(coloured[:, 0]).tolist() == [20]
-
-
-def test_inspect_of_pictures_shows_the_first(tmp_path, capsys):
-    picture = np.zeros((800, 1280), np.uint16)
-    picture[:, 640:] = 4095
-    write_celex5_pictures(tmp_path / "p.bin", [picture, np.zeros_like(picture)], [0, 33_000])
-    assert main(["inspect", str(tmp_path / "p.bin"), "--out", str(tmp_path / "out")]) == 0
-    assert "pictures    2" in capsys.readouterr().out
-    assert cv2.imread(str(tmp_path / "out" / "p.bin.png"))[400, [10, 1000], 0].tolist() == [0, 255]
 
 
 def test_one_factor_more_than_the_third_busiest_around_is_hot_and_thin_lines_are_not():
@@ -107,7 +96,7 @@ def test_an_event_stays_if_one_of_its_8_neighbours_fired_within_the_time(make_ev
 
 def test_a_recording_in_pieces_is_cleaned_as_a_whole(make_random_events):
     channels = [make_random_events(seed, 3000, 10**6, 20, 30) for seed in range(4)]
-    whole, pieces = (Cleaner(Cleaning(None, 4.0, 20_000), None) for _ in range(2))
+    whole, pieces = (Cleaner(Cleaning(None, 20_000), None) for _ in range(2))
     (together,) = whole.clean([Piece(channels, 10**6, 0.0)])
     parts = [
         Piece([slice_time(events, start, stop) for events in channels], stop, 0.0)
@@ -123,7 +112,7 @@ def test_a_recording_in_pieces_is_cleaned_as_a_whole(make_random_events):
 def test_listed_hot_pixels_of_a_mosaic_are_those_of_the_sensor(make_events, tmp_path):
     (tmp_path / "hot.txt").write_text("# x y\n3 2\n\n0, 1\n")
     channel = make_events([(0, 1, 1, 1), (1, 0, 0, 1)], 3, 4)
-    cleaner = Cleaner(Cleaning(str(tmp_path / "hot.txt"), 4.0, None), parse_mosaic("90 45 / 135 0"))
+    cleaner = Cleaner(Cleaning(str(tmp_path / "hot.txt"), None), parse_mosaic("90 45 / 135 0"))
     (piece,) = cleaner.clean([Piece([channel] * 4, 10, 0.0)])
     i0, i45, i90, i135 = piece.channels
     assert i45.t.tolist() == [1]  # 3 2 is the pixel behind 45 degrees of the cell in column 1, row 1
@@ -135,7 +124,7 @@ def test_listed_hot_pixels_of_a_mosaic_are_those_of_the_sensor(make_events, tmp_
 def test_found_hot_pixels_are_removed_from_their_channel_alone(make_random_events, make_events):
     quiet = make_random_events(1, 400, 10**6, 12, 16)
     hot = merge([quiet, make_events([(t, 5, 5, 1) for t in range(0, 10**6, 1000)], 12, 16)])
-    cleaner = Cleaner(Cleaning("found", 4.0, None), None)
+    cleaner = Cleaner(Cleaning("found", None), None)
     channels, ends = [hot, quiet, quiet, quiet], [0, 250_000, 10**6]
     parts = [Piece([slice_time(e, *span) for e in channels], span[1], 0.0) for span in itertools.pairwise(ends)]
     first, second, *_ = zip(*(piece.channels for piece in cleaner.clean(parts)), strict=True)
@@ -143,7 +132,7 @@ def test_found_hot_pixels_are_removed_from_their_channel_alone(make_random_event
     assert sum(map(len, second)) == len(quiet)
     assert cleaner.hot == 1
     with pytest.raises(ValueError, match="expected a file of hot pixels for live input"):
-        Cleaner(Cleaning("found", 4.0, None), None).clean([], live=True)
+        Cleaner(Cleaning("found", None), None).clean([], live=True)
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def read_lines(tmp_path, text, mosaic=None):
     path = tmp_path / "camera.txt"
     path.write_text(text)
     with path.open("rb") as file:
-        live = LiveLines(file, path.name, mosaic, idle_s=0.0)
+        live = LiveLines(file, path.name, mosaic)
         pieces = list(live)
         assert file.closed
         return live, pieces
@@ -62,7 +62,7 @@ def test_comments_commas_zeros_and_a_last_line_without_an_end_are_read(tmp_path,
     with pipe() as (source, camera):
         camera.write(b"# a camera\n\n")
         threading.Timer(0.05, camera.write, [b"  # its size\n4 3 # px\n0 0 0 1 0\n"]).start()
-        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        live = LiveLines(source, "pipe", None)
         assert (live.height, live.width) == (3, 4)
         assert next(iter(live)).until_us == 0
 
@@ -70,7 +70,7 @@ def test_comments_commas_zeros_and_a_last_line_without_an_end_are_read(tmp_path,
 def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads():
     with pipe() as (source, camera):
         camera.write(b"4 3\n")
-        pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
+        pieces = iter(LiveLines(source, "pipe", None))
         camera.write(b"5 0 0 1 0\n9 1 1 1 45\n12 ")
         assert next(pieces).until_us == 4
         camera.write(b"0 0 1 0\n7 2 2 1 0\n20 2 2 1 90\n")
@@ -79,7 +79,7 @@ def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads
         assert list(pieces) == []
     with pipe() as (source, camera):
         camera.write(b"4 3\n")
-        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        live = LiveLines(source, "pipe", None)
         before = time.perf_counter()
         camera.write(b"0 0 0 1 0\n10 0 0 1 0\n")
         camera.close()
@@ -89,31 +89,10 @@ def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads
         assert all(before <= piece.read_at <= after for piece in live)
 
 
-def test_a_file_that_grows_is_followed(tmp_path):
-    path = tmp_path / "camera.txt"
-    path.write_text("4 3\n0 0 0 1 0\n")
-
-    def grow():
-        for t in (10, 20, 30):
-            time.sleep(0.02)
-            with path.open("a") as file:
-                file.write(f"{t} 0 0 1 0\n")
-
-    with path.open("rb") as source:
-        live = LiveLines(source, path.name, None, idle_s=30.0)
-        thread = threading.Thread(target=grow)
-        thread.start()
-        pieces = iter(live)
-        until = 0
-        while until < 30:
-            until = next(pieces).until_us
-        thread.join()
-
-
 def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
     with pipe() as (source, camera):
         camera.write(b"4 3\n100 0 0 1 0\n200 0 0 1 0\n")
-        live = LiveLines(source, "pipe", None, idle_s=0.0)
+        live = LiveLines(source, "pipe", None)
         pieces = iter(live)
         assert next(pieces).until_us == 100
         camera.write(b"150 0 0 1 0\n300 9 0 1 0\n300 0 0 3 0\n300 0 0 1 30\nhello\n400 0 0 1 0\n")
@@ -137,7 +116,7 @@ def test_what_is_no_such_stream_is_refused(tmp_path, text, reason):
 def test_an_event_after_a_pause_waits_for_others_but_not_for_long():
     with pipe() as (source, camera):
         camera.write(b"4 3\n0 0 0 1 0\n")
-        pieces = iter(LiveLines(source, "pipe", None, idle_s=0.0))
+        pieces = iter(LiveLines(source, "pipe", None))
         assert next(pieces).until_us == 0
         written = time.perf_counter()
         camera.write(b"500000 0 0 1 0\n")

@@ -53,7 +53,6 @@ def test_the_folder_of_a_bag_is_read_behind_a_rotating_polarizer(folder):
     ("words", "message"),
     [
         (("inspect", "e.txt", "--part", "left"), "expected no part, which has no meaning for the format text"),
-        (("inspect", "e.txt", "--clock-mhz", "70"), "expected no clock_mhz, which has no meaning for the format text"),
         (("view", "e.txt", "--sequence", "lake", "--no-browser"), "a recording: expected no --sequence"),
         (("recover", "e.txt", "--method", "highpass", "--sequence", "lake"), "a recording: expected no --sequence"),
         (("recover", "-", "--live", "--part", "left"), "--live: expected no --part"),

@@ -1,7 +1,6 @@
 """True polarization from files in published layouts, written with known polarization."""
 
 import math
-from datetime import timedelta
 
 import numpy as np
 import pytest
@@ -91,29 +90,15 @@ def test_frames_of_a_davis_are_differences_of_two_samples_and_need_all_of_them(t
         aedat2_frames(path)
 
 
-def write_aedat4(path, frames, events):
-    dv = pytest.importorskip("dv_processing", reason="the extra live is not installed")
-    resolution = frames[0][0].shape[::-1]
-    config = dv.io.MonoCameraWriter.Config("DAVIS346")
-    config.addEventStream(resolution)
-    config.addFrameStream(resolution)
-    writer = dv.io.MonoCameraWriter(str(path), config)
-    store = dv.EventStore()
-    for t, x, y, p in events:
-        store.push_back(t, x, y, p > 0)
-    writer.writeEvents(store)
-    for raw, start, exposure_us in frames:
-        frame = dv.Frame(start, raw)
-        frame.exposure = timedelta(microseconds=exposure_us)
-        writer.writeFrame(frame)
-    return path
+def test_frames_of_aedat4_have_the_middle_of_their_exposure_and_the_known_polarization(tmp_path, make_events):
+    pytest.importorskip("dv_processing", reason="the extra live is not installed")
+    from studies.pdavis import write_aedat4
 
-
-def test_frames_of_aedat4_have_the_middle_of_their_exposure_and_the_known_polarization(tmp_path):
     raw, true_dolp, true_aolp = known(20, 24)
-    frames = [(raw, 1000, 8000), (raw, 34_000, 8000), (raw, 67_000, 2000)]
-    truth = read_truth(write_aedat4(tmp_path / "e.aedat4", frames, [(5000, 3, 4, 1)]), MOSAIC)
-    assert truth.t_us.tolist() == [5000, 38_000, 68_000]
+    t_us = np.array([5000, 38_000, 68_000])
+    write_aedat4(tmp_path / "e.aedat4", make_events([(5000, 3, 4, 1)], 20, 24), t_us, np.stack([raw] * 3))
+    truth = read_truth(tmp_path / "e.aedat4", MOSAIC)
+    assert truth.t_us.tolist() == t_us.tolist()
     inside = np.s_[:, 1:-1, 1:-1]
     assert (truth.dolp[inside] - true_dolp[None][inside]).abs().max() < 1e-7
     assert torch.sin(truth.aolp[inside] - true_aolp[None][inside]).abs().max() < 1e-6

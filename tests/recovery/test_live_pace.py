@@ -88,7 +88,7 @@ def method(clock, work_s, taken):
 )
 def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkeypatch, step_us, windows, work_s):
     taken: list[int] = []
-    camera, rule = source(waits=False), WindowRule(WINDOW_US, None, step_us)
+    camera, rule = source(waits=False), WindowRule(WINDOW_US, step_us)
     frames = list(frames_of(camera, rule, method(clock, work_s, taken)))
     assert sum(frame.window.joined for frame in frames) == windows
     assert clock.now_s < 1.5 + 0.3  # one by one, they would take up to 15 s
@@ -105,14 +105,14 @@ def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkey
 
 
 def test_windows_stay_apart_if_the_processor_keeps_up_or_the_source_waits(clock):
-    frames = frames_of(source(waits=False), WindowRule(WINDOW_US, None, None), method(clock, 0.005, []))
+    frames = frames_of(source(waits=False), WindowRule(WINDOW_US, None), method(clock, 0.005, []))
     beginning = list(itertools.islice(frames, 20))
     clock.now_s += 0.3
     rest = list(frames)
     assert [frame.window.joined for frame in (*beginning, *rest)] == [1] * 150
     assert rest[0].latency_s > 0.2
     assert rest[-1].latency_s < 0.01
-    frames = list(frames_of(source(waits=True), WindowRule(WINDOW_US, None, None), method(clock, 0.1, [])))
+    frames = list(frames_of(source(waits=True), WindowRule(WINDOW_US, None), method(clock, 0.1, [])))
     assert [frame.window.stop_us for frame in frames] == [*range(WINDOW_US, 1_500_001, WINDOW_US)]
 
 

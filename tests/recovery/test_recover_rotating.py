@@ -25,7 +25,7 @@ def recording(tmp_path):
     scene = scene_from_polarization(*maps)
     camera, size = Camera(SENSORS["default"], key=1), (HEIGHT, WIDTH)
     events = emulate_rotating(rotating, camera, scene, resting_trajectory(*size), 900_000, Grid(*size))
-    write_hdf5(tmp_path / "e.h5", events, 900_000)
+    write_hdf5(tmp_path / "e.h5", events)
     return tmp_path / "e.h5"
 
 

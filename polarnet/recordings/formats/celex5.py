@@ -1,4 +1,4 @@
-"""Files of a CeleX-5: raw ones (BIN, little endian), and event lists from the vendor's converter (CSV).
+"""Raw files of a CeleX-5 (BIN, little endian).
 
 A BIN file has packages of events or of a full picture, as the sensor sends them. A header gives the data type (bit 0
 loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day and the number of packages. Each
@@ -7,8 +7,6 @@ The last byte of a package is 0 for a full picture.
 
 The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
 and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
-
-A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode.
 """
 
 import struct
@@ -18,16 +16,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import Int64, UInt8, UInt16
 
-from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
 from polarnet.runtime.compilation import compiled
 
 HEIGHT, WIDTH = 800, 1280
 WHITE = 4095  # maximum of the 12-bit converter
 
-CLOCK_MHZ = 100.0  # the vendor's default
+CLOCK_MHZ = 100  # the vendor's default
 TICK_CYCLES = 1024  # clock cycles per step of the time stamp
 
 HEADER = struct.Struct("<8B I")
@@ -44,7 +41,6 @@ PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
 ROW, COLUMN = 2, 1  # kinds of items
-CSV_COLUMNS = 5
 
 
 Header = namedtuple("Header", "data_type loop_a loop_b loop_c event_format hour minute second packages")
@@ -67,29 +63,20 @@ def matches_bin(path: Path, head: bytes) -> bool:
 
 
 def open_bin(path: Path, choices: Choices) -> Source:
-    """Open the events of a BIN file of event format 1; format 2 and some modes have no polarity and are refused.
+    """Open the events of a BIN file of event format 1 in Event Intensity mode; RecordingError for other modes.
 
     A pixel's polarity is the sign of its intensity change. Its first event is compared with 0 and therefore brighter.
     Time 0 is the first time stamp. Full pictures between the events are left out; `celex5_pictures` reads them.
     """
     header = _opened(path)
-    if header.event_format == 0:
+    looped = header.data_type & LOOP
+    if header.event_format != 1 or looped or header.loop_a < INTENSITY:
+        mode = dict(enumerate(MODES)).get(header.loop_a, "unknown")
         raise RecordingError(
-            f"{path.name}: the events are of format 0, whose intensities are wrong according to the vendor; record in "
-            f"event format 1"
+            f"{path.name}: expected Event Intensity mode, event format 1, got {'a loop from ' if looped else ''}mode "
+            f"{mode}, event format {header.event_format}; other modes and format 2 have no polarity, format 0 has "
+            f"wrong intensities, and in a loop times stand still during pictures: record again"
         )
-    if header.data_type & LOOP:
-        raise RecordingError(
-            f"{path.name}: recorded in loop mode, where the time stamps of events do not run on during pictures; "
-            f"record events and pictures each in a mode of their own"
-        )
-    if header.event_format == 2 or header.loop_a < INTENSITY:
-        mode = MODES[header.loop_a] if header.loop_a < len(MODES) else MODES[INTENSITY]
-        raise RecordingError(
-            f"{path.name}: events of a CeleX-5 in its mode {mode}, event format {header.event_format}, have no "
-            f"polarity, so nothing can be recovered from them; record in Event Intensity mode, event format 1"
-        )
-    clock_mhz = choices.clock_mhz or CLOCK_MHZ
 
     def blocks(counts: Counts) -> Iterator[Block]:
         state = np.array([-1, -1, 0])  # row, last time stamp, ticks since the first
@@ -104,14 +91,14 @@ def open_bin(path: Path, choices: Choices) -> Source:
                 events, orphans, unchanged = _decode(package[:-1], state, last_adc, columns)
                 counts.update({"orphans": orphans, "no_change": unchanged})
                 t, x, y, p = (column[:events] for column in columns)
-                yield Block(microseconds(t, clock_mhz), x, y, p)
+                yield Block(microseconds(t), x, y, p)
 
     return Source(HEIGHT, WIDTH, blocks)
 
 
-def microseconds(ticks: np.ndarray, clock_mhz: float | int) -> np.ndarray:
+def microseconds(ticks: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
     """Convert the sensor's time stamps to microseconds, rounded down as in the vendor's library."""
-    return np.asarray(ticks, np.int64) * (1000 * TICK_CYCLES) // round(1000 * clock_mhz)
+    return ticks * TICK_CYCLES // CLOCK_MHZ
 
 
 def celex5_pictures(path: Path) -> Iterator[Picture]:
@@ -125,37 +112,6 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
                     f"the file is damaged"
                 )
             yield Picture(None if t_ms is None else 1000 * t_ms + 500, _unpacked(package[:-1]))
-
-
-def matches_csv(path: Path, head: bytes) -> bool:
-    """Whether there are five columns with commas, the fourth mostly a polarity."""
-    lines = [line.words for line in numbers_of(head)]
-    if not lines or b"," not in head or len(lines[0]) != CSV_COLUMNS:
-        return False
-    return 2 * sum(len(words) == CSV_COLUMNS and words[3] in ("-1", "0", "1") for words in lines) > len(lines)
-
-
-def open_csv(path: Path, choices: Choices) -> Source:
-    """Open a CSV file of Event Intensity mode; the other two modes have no polarity and are refused.
-
-    Times are microseconds. Converters older than SDK 2.0 (December 2019) wrote the sensor's time stamps; `clock_mhz`
-    selects this interpretation.
-    """
-    lines = numbers_of(start_of(path, HEAD_BYTES))
-    if lines and len(lines[0].words) != CSV_COLUMNS:
-        raise RecordingError(
-            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
-            f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
-        )
-
-    def blocks(counts: Counts) -> Iterator[Block]:
-        for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
-            changed = rows[:, 3] != 0
-            row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
-            counts["no_change"] += len(rows) - len(t)
-            yield Block(t if choices.clock_mhz is None else microseconds(t, choices.clock_mhz), column, row, p)
-
-    return Source(HEIGHT, WIDTH, blocks)
 
 
 def _unpacked(data: np.ndarray) -> np.ndarray:

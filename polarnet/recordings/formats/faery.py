@@ -8,15 +8,7 @@ from pathlib import Path
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import (
-    Block,
-    CameraFrames,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    chosen_part,
-)
+from polarnet.recordings.source import Block, CameraFrames, Choices, Counts, RecordingError, Source, chosen_part
 
 FAERY = Library("faery", "faery", "the file is damaged")
 

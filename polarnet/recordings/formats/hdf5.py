@@ -1,7 +1,7 @@
 """HDF5 files in the layouts of `LAYOUTS`: where their columns t (microseconds, or seconds), x, y and p are."""
 
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,49 +76,40 @@ of E2VID and EVREAL. M3ED: Chaney et al. 2023. MVSEC: Zhu et al. 2018. DSEC: Geh
 state 260 x 346 and 480 x 640."""
 
 
-def matcher(name: str) -> Callable[[Path, bytes], bool]:
-    """A check of whether a file is HDF5 with the tables of a layout; for DSEC's, the last one tried, any HDF5."""
-
-    def matches(path: Path, head: bytes) -> bool:
-        if not head.startswith(MAGIC) or name == "dsec":
-            return head.startswith(MAGIC)
-        try:
-            return bool(_parts(LAYOUTS[name], _described(path)[0]))
-        except (RecordingError, RuntimeError):
-            return False  # the opener of DSEC's layout reports the reason
-
-    return matches
+def matches(layout: Layout, path: Path, head: bytes) -> bool:
+    """Whether a file is HDF5 with the tables of a layout; for DSEC's, the last one tried, any HDF5."""
+    if not head.startswith(MAGIC) or layout is LAYOUTS["dsec"]:
+        return head.startswith(MAGIC)
+    try:
+        return bool(_parts(layout, _described(path)[0]))
+    except (RecordingError, RuntimeError):
+        return False  # `open_hdf5` reports the reason for DSEC's layout
 
 
-def opener(name: str) -> Callable[[Path, Choices], Source]:
-    """A function that opens the events of a file of a layout."""
-    layout = LAYOUTS[name]
+def open_hdf5(layout: Layout, path: Path, choices: Choices) -> Source:
+    """Open the events of a file of a layout."""
+    tables, settings = _described(path)
+    parts = _parts(layout, tables)
+    if not parts:
+        absent = ", ".join(table for table in dict(layout.of(layout.parts[0])) if table not in tables)
+        raise RecordingError(f"{path.name}: expected HDF5 of {layout.owner}: there is no {absent}")
+    part = parts[0] if parts == [""] else chosen_part(path, choices.part, parts, "camera")
+    columns = layout.of(part)
+    lengths = [_length(path, tables, *column) for column in columns]
+    if len(set(lengths)) > 1:
+        raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
+    offset_us = _whole(path, "t_offset", settings.get("t_offset")) or 0
 
-    def open_file(path: Path, choices: Choices) -> Source:
-        tables, settings = _described(path)
-        parts = _parts(layout, tables)
-        if not parts:
-            absent = ", ".join(table for table in dict(layout.of(layout.parts[0])) if table not in tables)
-            raise RecordingError(f"{path.name}: expected HDF5 of {layout.owner}: there is no {absent}")
-        part = parts[0] if parts == [""] else chosen_part(path, choices.part, parts, "camera")
-        columns = layout.of(part)
-        lengths = [_length(path, tables, *column) for column in columns]
-        if len(set(lengths)) > 1:
-            raise RecordingError(f"{path.name}: its columns t, x, y, p have different lengths, {lengths}")
-        offset_us = _whole(path, "t_offset", settings.get("t_offset")) or 0
+    def blocks(counts: Counts) -> Iterator[Block]:
+        seconds: bool | None = None
+        for number, (t, x, y, p) in enumerate(_read(path, columns)):
+            counts.share_read = min(1.0, number * BLOCK_EVENTS / lengths[0])
+            if seconds is None:
+                seconds = layout.seconds and t.dtype.kind == "f" and not np.equal(t, np.floor(t)).all()
+            t = np.rint(t * 1e6) if seconds else t
+            yield Block(_microseconds(path, t) + offset_us, x, y, p)
 
-        def blocks(counts: Counts) -> Iterator[Block]:
-            seconds: bool | None = None
-            for number, (t, x, y, p) in enumerate(_read(path, columns)):
-                counts.share_read = min(1.0, number * BLOCK_EVENTS / lengths[0])
-                if seconds is None:
-                    seconds = layout.seconds and t.dtype.kind == "f" and not np.equal(t, np.floor(t)).all()
-                t = np.rint(t * 1e6) if seconds else t
-                yield Block(_microseconds(path, t) + offset_us, x, y, p)
-
-        return Source(*_stated_size(path, settings, settings.get(layout.resolution.format(part))), blocks)
-
-    return open_file
+    return Source(*_stated_size(path, settings, settings.get(layout.resolution.format(part))), blocks)
 
 
 def _parts(layout: Layout, tables: Collection[str]) -> list[str]:
@@ -132,9 +123,8 @@ def trigger_times_us(path: Path) -> np.ndarray:
     if TRIGGERS not in tables:
         raise RecordingError(f"{path.name}: expected a table /{TRIGGERS} of times in microseconds, there is none")
     _length(path, tables, TRIGGERS, None)
-    return np.concatenate(
-        [np.empty(0, np.int64), *(_microseconds(path, t) for (t,) in _read(path, [(TRIGGERS, None)]))]
-    )
+    blocks = [_microseconds(path, t) for (t,) in _read(path, [(TRIGGERS, None)])]
+    return np.concatenate([np.empty(0, np.int64), *blocks])
 
 
 def e2p_frames(path: Path) -> CameraFrames:

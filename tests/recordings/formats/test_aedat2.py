@@ -50,13 +50,6 @@ def test_an_event_may_look_like_a_line_of_the_header_and_times_run_on_when_32_bi
     assert read(path)[1][0] == [2**32 - 5, 2**32 - 1, 2**32 + 3]
 
 
-def test_one_corrupt_stamp_moves_no_other_event(tmp_path, read):
-    t = list(range(1000, 3000, 10))
-    words = [(address(1, 1, 1), 2**32 - 50_000_000 if k == 80 else now) for k, now in enumerate(t)]
-    _, (found, *_), repairs = read(write(tmp_path / "e.aedat", words))
-    assert (found, repairs) == (t[:80] + t[81:], {"time_glitches": 1})
-
-
 def test_a_camera_that_the_header_does_not_name_needs_its_size(tmp_path, read):
     path = write(tmp_path / "e.aedat", [(address(1, 1, 1), 5)], b"#!AER-DAT2.0\r\n")
     with pytest.raises(RecordingError, match="the file does not say how large the sensor is"):

@@ -93,7 +93,8 @@ def test_the_sensors_name_generation_or_system_stands_for_its_size(tmp_path, rea
 
 
 @pytest.mark.parametrize("wrong", [2**32 - 50_000_000, 2**31 + 9, 0])
-def test_one_corrupt_stamp_of_dat_moves_no_other_event(tmp_path, read, wrong):
+def test_one_corrupt_stamp_moves_no_other_event(tmp_path, read, wrong):
+    """Of DAT here; AEDAT-2 unwraps its stamps by the same function."""
     t = np.arange(100, 5000, 10) + (2**32 - 200 if wrong == 0 else 0)  # with 0, the stamps wrap after 20 events
     stamps = t % 2**32
     stamps[250] = wrong if wrong else 2**31 + 5
