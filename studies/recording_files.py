@@ -15,7 +15,7 @@ from polarnet.recordings.formats.aedat3 import PACKET
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
-from studies.celex5_writer import write_celex5_bin
+from studies.celex5_writer import write_celex5_bin, write_celex5_csv
 from studies.rosbag_writer import array_bytes, write_arrays, write_packets
 
 PACKET_EVENTS = 10_000
@@ -206,6 +206,7 @@ FILES: dict[str, tuple[str, Writer]] = {
         ".csv",
         binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
     ),
+    "celex5_csv": (".csv", write_celex5_csv),
     "celex5_bin": (".bin", write_celex5_bin),
 }
 """Suffix and writer of each format, and of further kinds of files whose first word is the format."""

@@ -42,7 +42,7 @@ from studies.study import (
 COUNT, SMALL = 10_000_000, 20_000  # events; the small file compiles every kernel
 PART = 1_000_000  # events that are made at a time, and microseconds that they take
 REPEATS = 3
-SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_bin": (800, 1280)}
+SENSORS = {"aedat2": (260, 346), "aedat3": (480, 640), "celex5_csv": (800, 1280), "celex5_bin": (800, 1280)}
 SENSOR = 720, 1280  # of the other formats
 PARTS = {"m3ed": "left", "mvsec": "left"}
 MEMORY_SIZES = (2_000_000, 8_000_000, 32_000_000, 128_000_000)

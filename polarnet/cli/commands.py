@@ -400,7 +400,7 @@ def _cleaning(command: Command) -> None:
 
 def _reading(command: Command) -> None:
     """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
-    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_bin, ...")
+    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
     command.add_argument(
         "--part", help="of a file with several: topic of a bag, stream of AEDAT, camera of M3ED or MVSEC"
     )

@@ -78,10 +78,11 @@ FORMATS = {
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
     "text": Format("lines `t x y p`", lines.matches_text, lines.open_text),
+    "celex5_csv": Format("CSV of a CeleX-5", celex5.matches_csv, celex5.open_csv),
     "celex5_bin": Format("BIN of a CeleX-5", celex5.matches_bin, celex5.open_bin),
 }
 """Ordered as they are tried on a file of unknown format."""
-PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_bin")
+PACKABLE = ("aedat3", "aedat2", "evt", "dat", "text", "celex5_csv", "celex5_bin")
 """Formats that are read from gzip and zip archives too."""
 
 

@@ -14,8 +14,8 @@ from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.noise import Cleaner, Cleaning, hot_pixels, never, read_hot_pixels, without_background
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.writers import write_text
 from polarnet.stokes import parse_mosaic
+from studies.celex5_writer import write_celex5_csv
 
 
 def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_sensor(tmp_path, columns):
@@ -59,11 +59,11 @@ def test_inspect_prints_findings_and_draws_no_hot_pixels(tmp_path, make_events, 
     monkeypatch.chdir(tmp_path)
     edge = make_events([(k, k % 50, 20, 1 - 2 * (k % 2)) for k in range(100)], 800, 1280)
     hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
-    write_text(tmp_path / "capture.txt", merge([edge, hot]))
-    assert main(["inspect", "capture.txt"]) == 0
+    write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
+    assert main(["inspect", "capture.csv"]) == 0
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed
-    picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.txt.png"))
+    picture = cv2.imread(str(tmp_path / "outputs" / "inspect" / "capture.csv.png"))
     assert picture.shape == (800, 1280, 3)
     coloured = np.argwhere((picture != 255).any(axis=-1))
     assert np.unique(coloured[:, 0]).tolist() == [20]

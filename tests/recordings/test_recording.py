@@ -11,6 +11,7 @@ from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
 from polarnet.stokes import parse_mosaic
+from studies.celex5_writer import write_celex5_csv
 from studies.recording_files import FILES
 
 SAMPLES = {
@@ -43,8 +44,8 @@ def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
 @pytest.mark.parametrize("size", [1, 7, 999, 1000, 10**6])
 def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, size):
     events = make_random_events(0, 1000, 10**6)
-    write_text(tmp_path / "e.txt", events)
-    chunks = list(open_recording(tmp_path / "e.txt").chunks(size))
+    write_celex5_csv(tmp_path / "e.csv", events)
+    chunks = list(open_recording(tmp_path / "e.csv").chunks(size))
     assert {len(chunk) for chunk in chunks[:-1]} <= {size}
     assert 0 < len(chunks[-1]) <= size
     for name in "txyp":
@@ -124,6 +125,7 @@ def test_the_share_that_is_read_grows_to_the_whole(name, tmp_path, monkeypatch, 
 def test_a_file_of_each_kind_has_the_events_that_were_written(kind, tmp_path, make_random_events):
     suffix, write = FILES[kind]
     events = make_random_events(1, 30_000, 10**6, 260, 346)
+    events = replace(events, height=800, width=1280) if kind == "celex5_csv" else events
     events = replace(events, t=events.t - events.t[0]) if kind == "event_stream" else events  # as faery writes them
     write(tmp_path / f"e{suffix}", events)
     part = {"m3ed": "left", "mvsec": "left"}.get(kind)
@@ -137,17 +139,17 @@ ANGLES = (0, 45, 90, 135)
 
 def test_four_files_in_any_order_or_one_mosaic_become_the_four_channels(tmp_path, make_random_events):
     events = {angle: make_random_events(angle, 200, 60_000) for angle in (90, 0, 135, 45)}
-    files = {angle: tmp_path / f"camera_{k}.txt" for k, angle in enumerate(events)}
+    files = {angle: tmp_path / f"camera_{k}.csv" for k, angle in enumerate(events)}
     for angle, path in files.items():
-        write_text(path, events[angle])
+        write_celex5_csv(path, events[angle])
     first = min(int(e.t[0]) for e in events.values())
     channels = read_four({-45 if angle == 135 else angle: path for angle, path in files.items()})
     for angle, channel in zip(ANGLES, channels, strict=True):
         assert torch.equal(channel.t, events[angle].t - first)
         assert torch.equal(channel.x, events[angle].x)
     events = make_random_events(1, 200, 60_000)
-    write_text(tmp_path / "a.txt", events)
-    channels = read_mosaic(tmp_path / "a.txt", parse_mosaic("90 45 / 135 0"))
+    write_celex5_csv(tmp_path / "a.csv", events)
+    channels = read_mosaic(tmp_path / "a.csv", parse_mosaic("90 45 / 135 0"))
     assert min(int(c.t[0]) for c in channels) == 0
     assert sum(map(len, channels)) == len(events)
 

@@ -1,4 +1,4 @@
-"""Raw files of a CeleX-5 (BIN, little endian).
+"""Files of a CeleX-5: raw ones (BIN, little endian), and event lists from the vendor's converter (CSV).
 
 A BIN file has packages of events or of a full picture, as the sensor sends them. A header gives the data type (bit 0
 loop mode, bit 1 IMU), the modes of the sensor, the event format, the time of day and the number of packages. Each
@@ -7,6 +7,8 @@ The last byte of a package is 0 for a full picture.
 
 The sensor sends 14-bit words, four in 7 bytes: the high 8 bits of each, then the low 6 of all. An item is two words,
 and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
+
+A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode.
 """
 
 import struct
@@ -18,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64, UInt8, UInt16
 
+from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
 from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
 from polarnet.runtime.compilation import compiled
 
@@ -41,6 +44,7 @@ PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
 
 ROW, COLUMN = 2, 1  # kinds of items
+CSV_COLUMNS = 5
 
 
 Header = namedtuple("Header", "data_type loop_a loop_b loop_c event_format hour minute second packages")
@@ -112,6 +116,33 @@ def celex5_pictures(path: Path) -> Iterator[Picture]:
                     f"the file is damaged"
                 )
             yield Picture(None if t_ms is None else 1000 * t_ms + 500, _unpacked(package[:-1]))
+
+
+def matches_csv(path: Path, head: bytes) -> bool:
+    """Whether there are five columns with commas, the fourth mostly a polarity."""
+    lines = [line.words for line in numbers_of(head)]
+    if not lines or b"," not in head or len(lines[0]) != CSV_COLUMNS:
+        return False
+    return 2 * sum(len(words) == CSV_COLUMNS and words[3] in ("-1", "0", "1") for words in lines) > len(lines)
+
+
+def open_csv(path: Path, choices: Choices) -> Source:
+    """Open a CSV file of Event Intensity mode (times in us); RecordingError for other modes, without polarity."""
+    lines = numbers_of(start_of(path, HEAD_BYTES))
+    if lines and len(lines[0].words) != CSV_COLUMNS:
+        raise RecordingError(
+            f"{path.name}: expected the 5 columns row,col,adc,polarity,t of a CeleX-5 in Event Intensity mode, got "
+            f"{len(lines[0].words)}; its other modes, of 3 or 4 columns, have no polarity"
+        )
+
+    def blocks(counts: Counts) -> Iterator[Block]:
+        for rows in number_blocks(path, (0,) * CSV_COLUMNS, 0, counts):
+            changed = rows[:, 3] != 0
+            row, column, p, t = (rows[:, k][changed] for k in (0, 1, 3, 4))
+            counts["no_change"] += len(rows) - len(t)
+            yield Block(t, column, row, p)
+
+    return Source(HEIGHT, WIDTH, blocks)
 
 
 def _unpacked(data: np.ndarray) -> np.ndarray:

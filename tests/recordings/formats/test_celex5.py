@@ -18,6 +18,11 @@ def package(content, last=1):
     return struct.pack("<I", len(content) + 1) + content + bytes([last])
 
 
+def write(path, rows):
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    return path
+
+
 def test_what_is_written_reads_back_equal(tmp_path, make_random_events):
     events = make_random_events(2, 5000, 9_000_000)
     written = write_celex5_bin(tmp_path / "e.bin", events)
@@ -103,3 +108,16 @@ def test_bin_files_that_cannot_be_events_are_refused_with_the_reason(tmp_path, c
     (tmp_path / "e.bin").write_bytes(content)
     with pytest.raises(RecordingError, match=rf"e\.bin: .*{message}"):
         read_recording(tmp_path / "e.bin", "celex5_bin")
+
+
+def test_csv_events_without_change_are_dropped(tmp_path, read):
+    rows = [(10, 20, 2000, 1, 5), (10, 21, 1999, -1, 7), (799, 1279, 4095, 1, 9), (1, 1, 7, 0, 10), (1, 1, 7, 0, 11)]
+    _, columns, repairs = read(write(tmp_path / "e.csv", rows))
+    assert (columns[0], columns[3], repairs) == ([5, 7, 9], [1, -1, 1], {"no_change": 2})
+
+
+@pytest.mark.parametrize("columns", [3, 4, 6])
+def test_csv_of_other_modes_is_refused_with_the_reason(tmp_path, columns):
+    path = write(tmp_path / "e.csv", [(10, 20, 5, 900, 7, 8)[:columns]])
+    with pytest.raises(RecordingError, match=rf"e\.csv: .*got {columns}; its other modes, of 3 or 4 columns, have no"):
+        read_recording(path, "celex5_csv")
