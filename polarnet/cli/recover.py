@@ -18,6 +18,7 @@ from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Setup, why_absent
+from polarnet.pictures.images import extension, picture_extensions
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
@@ -163,7 +164,10 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """ValueError for an unknown method, and for options that do not belong together or that the input would not use."""
+    """ValueError for a picture, an unknown method, and options that do not belong together or to the input."""
+    first = Path(options.input[0])
+    if first.is_file() and extension(first) in picture_extensions():
+        raise ValueError(f"{first.name} is a picture, no recording: `polarnet simulate {first}` makes events of it")
     if options.method is not None and options.method not in METHODS:
         near = did_you_mean(options.method, METHODS)
         raise ValueError(f"--method: expected a method of {', '.join(METHODS)}, got {options.method!r}{near}")
@@ -183,7 +187,7 @@ def check_options(options: argparse.Namespace) -> None:
         refuse(options, "--frames", NOT_WITH_FRAMES)
     if (options.live or rotating) and len(options.input) != 1:
         raise ValueError(f"{'--live' if options.live else '--rotating'}: expected one input, got {len(options.input)}")
-    if not Path(options.input[0]).is_dir() or is_recording(Path(options.input[0])):
+    if not first.is_dir() or is_recording(first):
         refuse(options, "a recording", ["sequence"])
     elif rotating or options.mosaic is not None:
         refuse(options, "a store", READING)

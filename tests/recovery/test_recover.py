@@ -233,7 +233,8 @@ def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, 
 
 
 def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, capsys):
-    one = write_lines(tmp_path / "camera.txt", make_channel(1))
+    one, picture = write_lines(tmp_path / "camera.txt", make_channel(1)), tmp_path / "lake.JPG"
+    picture.touch()
     for files, reason in (
         ([one], "say where the polarizers of its pixels are"),
         ([one, one], "four files with --angles, got 2"),
@@ -244,6 +245,7 @@ def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, ca
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
         ([one, one, "--live"], "--live: expected one input, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
+        ([picture], "lake.JPG is a picture, no recording: `polarnet simulate"),
     ):
         assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
         assert not (tmp_path / "out").exists()
