@@ -26,6 +26,7 @@ from polarnet.terminal.progress import ProgressBar
 MAX_WINDOW_RATIO = 1.25  # between the frames' interval and the networks' window, beyond which a warning says so
 MIN_AGREEMENT = 0.1  # correlation of events and frames (`Lag.agreement`); below it their lag is not known
 MAX_LAG = 0.5  # frame intervals
+MAX_LISTED = 8  # files that a note names
 
 
 class Recorded(NamedTuple):
@@ -46,15 +47,20 @@ def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleani
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of recordings, got {'a file' if root.exists() else 'none'}")
-    recordings, notes = [], []
+    recordings, notes, others = [], [], []
     files = sorted(path for path in root.rglob("*") if path.is_file())
     for path in ProgressBar(files, "recordings", unit="file"):
         try:
-            if detect_format(path) not in truth_formats():
-                raise RecordingError(f"expected a format with frames, {', '.join(truth_formats())}")
-            recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning))
+            if _holds_frames(path):
+                recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning))
+            else:
+                others.append(path.name)
         except RecordingError as error:
             notes.append(f"{path.name} was skipped: {str(error).removeprefix(f'{path.name}: ')}.")
+    if others:
+        names = ", ".join([*others[:MAX_LISTED], *(["..."] if len(others) > MAX_LISTED else [])])
+        formats = ", ".join(truth_formats())
+        notes.append(f"{len(others)} files of other formats than those with frames, {formats}, were skipped: {names}.")
     if not recordings:
         raise ValueError(f"{root}: no recording with true polarization. {' '.join(notes) or 'The folder is empty.'}")
     sizes = {one.truth.dolp.shape[1:] for one in recordings}
@@ -64,6 +70,14 @@ def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleani
     folder.mkdir(parents=True)
     _write(folder, recordings)
     return [*notes, *(note for one in recordings for note in one.notes)]
+
+
+def _holds_frames(path: Path) -> bool:
+    """Whether a file has a format with frames."""
+    try:
+        return detect_format(path) in truth_formats()
+    except RecordingError:
+        return False
 
 
 def read_recorded(path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning) -> Recorded:
