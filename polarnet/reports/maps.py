@@ -123,3 +123,5 @@ def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.nda
 
 
 DOLP_TABLE, EVENT_TABLE = table_of(matplotlib.colormaps[DOLP_COLOURS]), table_of(EVENT_COLOURS)
+AOLP_TABLE = angle_image(torch.ones(1, 256), torch.arange(256)[None] * (math.pi / 256))[0]
+"""The hues of `angle_image` at DoLP 1; a smaller DoLP blends them with white."""

@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
+from polarnet.reports.maps import AOLP_TABLE, DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
 from polarnet.runtime.files import replaced
 from polarnet.storage.panels import NO_EVENTS, Panel
 from polarnet.terminal.progress import ProgressBar
@@ -37,7 +37,7 @@ COLOURS = {
     "events": EVENT_TABLE,
     "s0": table_of(matplotlib.colormaps["gray"]),
     "dolp": DOLP_TABLE,
-    "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
+    "aolp": AOLP_TABLE,
     "error": table_of(matplotlib.colormaps["magma"]),
 }
 
