@@ -259,8 +259,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
 - a folder of division-of-time captures
 - with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
-dv://HOST:PORT of a program that streams its events, or dv://camera
-With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
+dv://HOST:PORT of a program that streams its events, or dv://camera""",
     )
     add = recover.add_argument
     add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, a folder, or -")

@@ -133,11 +133,9 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner,
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
         return open_live(options.input[0], mosaic, options.idle, cleaner)
-    method = METHODS.get(options.method)
-    plain = method is not None and method.reconstructs and method.wraps is None  # NAME+gain needs four channels
     open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
-    files = Files(paths, options.angles, mosaic, options.sequence, plain, open_file, config.recordings)
+    files = Files(paths, options.angles, mosaic, options.sequence, open_file, config.recordings)
     return open_files(files, work, options.size, cleaner)
 
 

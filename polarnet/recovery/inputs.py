@@ -43,8 +43,6 @@ class Files:
     mosaic: Mosaic | None = None
     sequence: str | None = None
     """Sequence to read from an event store or a folder that holds several."""
-    plain: bool = False
-    """Whether any other file is one channel, of a camera without polarizers."""
     open: Open = open_recording
     captures: RecordingsConfig | None = None
     """Settings of division-of-time captures; needed for a folder of them."""
@@ -169,12 +167,9 @@ def _channels(files: Files, work: Path) -> Channels:
     if (path / METADATA).is_file():
         store = EventStore.open(path)
         return _stored(store, _named(files.sequence, store.sequences, path.name))
-    if files.plain:
-        return open_plain(path, files.open)
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
-        f"...; for its intensity alone, give a --method that reconstructs it, such as e2v or highpass"
+        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
     )
 
 

@@ -62,7 +62,7 @@ class Input(NamedTuple):
     repairs: Mapping[str, Mapping[str, int]] = {}
     """Unusable events by file and kind (`polarnet.recordings.source.REPAIRS`), counted while `pieces` are read."""
     channels: int = 4
-    """4, or 1 for a camera behind a rotating polarizer or none."""
+    """4, or 1 for a camera behind a rotating polarizer."""
     live: bool = False
     """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
     waits: bool = True
@@ -223,9 +223,8 @@ def _live_runs(
 
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:
-    """ValueError for a DoLP with NaN or infinity, but for a camera without polarizers, which has none."""
-    plain = frame.intensities is not None and len(frame.intensities) == 1
-    if not plain and not frame.dolp.isfinite().all():
+    """ValueError for a DoLP with NaN or infinity."""
+    if not frame.dolp.isfinite().all():
         raise ValueError(
             f"the DoLP of the window from {window.start_us} to {window.stop_us} us is not finite: the weights or the "
             "thresholds are no working ones; the frames before it are whole"

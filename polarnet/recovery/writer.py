@@ -1,8 +1,7 @@
 """Write the results of `polarnet recover`: numbers (Zarr), pictures (PNG), a video, and a page.
 
-A picture shows DoLP, AoLP and the events of the window side by side; of a camera without polarizers, the intensity and
-the events. The video's pictures are labelled and also show polarization with the reconstructed S0. Everything is
-written as frames arrive, in constant memory.
+A picture shows DoLP, AoLP and the events of the window side by side. The video's pictures are labelled and also show
+polarization with the reconstructed S0. Everything is written as frames arrive, in constant memory.
 """
 
 import shutil
@@ -28,7 +27,6 @@ from polarnet.reports.maps import (
     dolp_image,
     encode_png,
     event_image,
-    intensity_image,
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_player
@@ -45,13 +43,12 @@ MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's 
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
 GAP = 4  # pixels between the maps of a picture
-DOLP, INTENSITY, ANGLE, EVENTS = "DoLP", "intensity", "AoLP (hue), DoLP (saturation)", "events"  # captions
+DOLP, ANGLE, EVENTS = "DoLP", "AoLP (hue), DoLP (saturation)", "events"  # captions
 RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, end of its window, microseconds from the first event",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
-    "intensity": "intensity from 0 to 1, divided by 65535, of a camera without polarizers; it has no dolp",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
 }
 
@@ -99,7 +96,6 @@ class RecoveryWriter:
         self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
         self.frames = self.stop_us = 0
-        self._plain = False
         self._sample = _Sample([])
         self._scale = EventScale()
         self._sheet: Sheet | None = None
@@ -126,7 +122,6 @@ class RecoveryWriter:
 
     def add(self, window: EventWindow, prediction: Prediction, live: bool = False) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long, or `live` and cores few."""
-        self._plain = plain_intensity(prediction) is not None
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
         self._wait(0 if live and usable_cores() <= FEW_CORES else MAX_QUEUED)
         self.frames += 1
@@ -139,8 +134,7 @@ class RecoveryWriter:
             (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
         video = VIDEO if "mp4" in self.outputs and self.frames else None
         films = [_film(source, pictures)] if pictures else []
-        title = f"{'Intensity' if self._plain else 'DoLP'} from events: {source}"
-        return write_player(self.folder / "index.html", title, films, facts, notes, video)
+        return write_player(self.folder / "index.html", f"DoLP from events: {source}", films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
         while len(self._waiting) > most:
@@ -169,7 +163,7 @@ class RecoveryWriter:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        above, below = {name: maps[name] for name in (EVENTS, DOLP, INTENSITY) if name in maps}, {}
+        above, below = {name: maps[name] for name in (EVENTS, DOLP)}, {}
         true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
             s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
@@ -193,9 +187,7 @@ class RecoveryWriter:
         return None if intensities is None else intensities.mean(0).float()
 
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
-        plain = plain_intensity(prediction)
-        name, values = ("dolp", prediction.dolp) if plain is None else ("intensity", plain)
-        frame = {"t_us": np.array(window.stop_us, np.int64), name: _quantised(values * 65535, 65535)}
+        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": _quantised(prediction.dolp * 65535, 65535)}
         if prediction.aolp is not None:
             frame["aolp"] = _quantised(prediction.aolp * (65536 / np.pi) % 65536, 65535)
         if prediction.log_variance is not None:
@@ -205,8 +197,7 @@ class RecoveryWriter:
 
 def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Captioned:
     """The maps of a frame as pictures, by caption."""
-    plain = plain_intensity(prediction)
-    maps = {DOLP: dolp_image(prediction.dolp)} if plain is None else {INTENSITY: intensity_image(plain)}
+    maps = {DOLP: dolp_image(prediction.dolp)}
     if prediction.aolp is not None:
         maps[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
     return maps | {EVENTS: events}
@@ -217,13 +208,6 @@ def _side_by_side(maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
     return with_even_sides(np.concatenate([part for one in maps.values() for part in (one, gap)][:-1], axis=1))
 
 
-def plain_intensity(prediction: Prediction) -> Float[Tensor, "h w"] | None:
-    """Intensity of a frame of a camera without polarizers; None for any other frame."""
-    if prediction.intensities is None or len(prediction.intensities) > 1:
-        return None
-    return prediction.intensities[0].float()
-
-
 def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
@@ -232,7 +216,6 @@ def _byte_maps(
     events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
 ) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
     """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
-    plain = plain_intensity(prediction)
     maps: dict[tuple[str, Kind], Tensor] = {("Events", "events"): signed_bytes(events)}
     if true is not None:
         maps |= {
@@ -240,8 +223,6 @@ def _byte_maps(
             (TRUTH, "aolp"): angle_bytes(true.aolp),
             (TRUTH, "dolp"): fraction_bytes(true.dolp),
         }
-    if plain is not None:
-        return maps | {(RECOVERED, "s0"): fraction_bytes(plain)}
     if prediction.intensities is not None and true is None:
         maps[RECOVERED, "s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
     maps[RECOVERED, "dolp"] = fraction_bytes(prediction.dolp)

@@ -22,8 +22,8 @@ from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.scenes import SceneStore
 
 MAX_FILMS = 12  # sequences of a store shown without a choice
-APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "aolp": "aolp"}
-"""Quantity of each array of recovered.zarr and truth.zarr."""
+APPENDED: Sequence[Kind] = ("s0", "dolp", "aolp")
+"""Arrays of recovered.zarr and truth.zarr that are shown, each named after its quantity."""
 
 
 def films_of(path: Path, sequences: Sequence[str] = (), open_file: Open = open_recording) -> list[Film]:
@@ -109,17 +109,16 @@ def _truth(s0: Tensor, dolp: Tensor, aolp: Tensor) -> list[Map]:
 def _appended_film(path: Path) -> Film:
     """A recovery or the truth of a simulation, from its growing arrays: frames spread evenly over them."""
     group = zarr.open_group(path, mode="r")
-    arrays: dict[str, Any] = {name: group[name] for name in ("t_us", *APPENDED) if name in group}
-    if "t_us" not in arrays or len(arrays) < 2:
+    arrays: dict[Kind, Any] = {name: group[name] for name in APPENDED if name in group}
+    if "t_us" not in group or not arrays:
         raise ValueError(f"{path}: expected arrays t_us and dolp, or a store of polarnet; got {sorted(group.keys())}")
-    places = np.unique(np.linspace(0, arrays["t_us"].shape[0] - 1, MAX_FRAMES).round().astype(int))
-    t_us = arrays.pop("t_us")[:][places].tolist()
-    frames = {APPENDED[name]: np.stack([array[int(k)] for k in places]) for name, array in arrays.items()}
-    read = {
-        kind: (angle_bytes if kind == "aolp" else fraction_bytes)(dequantise(kind, steps))
-        for kind, steps in frames.items()
-    }
-    return Film(path.parent.name, t_us, _maps("truth" if path.stem == "truth" else path.stem, read))
+    times: Any = group["t_us"]
+    places = np.unique(np.linspace(0, times.shape[0] - 1, MAX_FRAMES).round().astype(int))
+    read = {}
+    for kind, array in arrays.items():
+        frames = dequantise(kind, np.stack([array[int(k)] for k in places]))
+        read[kind] = angle_bytes(frames) if kind == "aolp" else fraction_bytes(frames)
+    return Film(path.parent.name, times[:][places].tolist(), _maps(path.stem, read))
 
 
 def _maps(source: str, values: Mapping[Kind, Tensor]) -> list[Map]:

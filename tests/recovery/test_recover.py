@@ -16,8 +16,6 @@ from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks import load_network, shipped_weights
-from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.networks.e2v.firenet import FireNet
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
 from polarnet.recovery.inputs import Files, open_files
@@ -156,32 +154,6 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     assert run(store, *arguments, *method, out=tmp_path / "new" / "out") == 1
     assert reason in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("method", ["highpass", "e2v"])
-def test_reconstructed_intensity_is_the_video_of_a_camera_without_polarizers(
-    method, channels, tmp_path, at_root, capsys
-):
-    file = write_lines(tmp_path / "camera.txt", channels[1])
-    weights = []
-    if method == "e2v":
-        torch.manual_seed(0)
-        network, path = FireNet(5), tmp_path / "mine.safetensors"
-        save_checkpoint(path, network.state_dict(), {"network": "firenet", "config": {"bins": network.bins}})
-        weights = ["--weights", str(path)]
-    assert main(["recover", str(file), "--method", method, "--out", str(tmp_path / "out"), *weights]) == 0
-    assert (tmp_path / "out" / "recovered.mp4").stat().st_size > 0
-    group = zarr.open_group(tmp_path / "out" / "recovered.zarr", mode="r")
-    assert set(group.array_keys()) == {"t_us", "intensity"}
-    assert group["intensity"].shape == (3, HEIGHT, WIDTH)
-    assert "Intensity from events: camera.txt" in (tmp_path / "out" / "index.html").read_text()
-    four = [*[str(file)] * 4, "--angles", "0", "45", "90", "135"]  # the same light behind all
-    assert main(["recover", *four, "--method", method, "--out", str(tmp_path / "four"), *weights]) == 0
-    dolp = zarr.open_group(tmp_path / "four" / "recovered.zarr", mode="r")["dolp"][:]
-    assert not dolp.any()
-    capsys.readouterr()
-    assert main(["recover", str(file), "--method", f"{method}+gain", "--out", str(tmp_path / "gain"), *weights]) != 0
-    assert "is one file of events: say where the polarizers" in capsys.readouterr().err
 
 
 def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
