@@ -15,7 +15,6 @@ from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
 from polarnet.captures.targets import calibrate_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
-from polarnet.events.streaming import WindowRule
 from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
@@ -62,9 +61,7 @@ def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clea
     return _input(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
 
 
-def open_rotating(
-    path: Path, rotation: Rotation, open_file: Open, size: Sequence[int] | None
-) -> tuple[Input, Rotation]:
+def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:
     """Open the events of one camera behind a rotating polarizer, whose times count from the first event.
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
@@ -73,7 +70,7 @@ def open_rotating(
     first = next(channels.blocks(), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
-    return _input(path.name, channels, size), rotation.since(int(first[0].t[0]))
+    return _input(path.name, channels), rotation.since(int(first[0].t[0]))
 
 
 def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
@@ -126,13 +123,8 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
         turn = 1.0 if rate_hz is None else math.copysign(1.0, rate_hz)
         return triggered_rotation(_trigger_times_us(triggers), start_angle, turn)
     if rate_hz is None:
-        raise ValueError("expected the rate of the polarizer (--rotating HZ) or its triggers (--triggers FILE)")
+        raise ValueError("expected the rate of the polarizer (--rate HZ) or its triggers (--triggers FILE)")
     return steady_rotation(rate_hz, start_angle)
-
-
-def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule:
-    """Consecutive windows of `step_us` (default: half a turn)."""
-    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None, None)
 
 
 def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import (
     SHORTEST_STEP_US,
     TRAINED_WINDOW_US,
@@ -98,8 +97,6 @@ class ChosenMethod:
     """Contrast thresholds of the camera, ON and OFF; None: those of the method's section."""
     binning: int | None = None
     """Side in pixels of the blocks that the network sees; None: that of the method's section."""
-    rotation: Rotation | None = None
-    """Angle of the rotating polarizer before the camera, by the clock of the events."""
     frames: StokesFrames | None = None
     """Frames of the camera, by the clock of the events."""
 
@@ -112,12 +109,7 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
     tune()
     method = METHODS[chosen.name]
     setup = setup_of(method)
-    setup = replace(
-        setup,
-        precision=precision_on(setup.device, chosen.precision),
-        rotation=chosen.rotation,
-        frames=chosen.frames,
-    )
+    setup = replace(setup, precision=precision_on(setup.device, chosen.precision), frames=chosen.frames)
     if chosen.frames is not None and not method.takes_frames:
         raise ValueError(f"--frames is for --method {', '.join(_framed())}, {method.name} does not use them")
     for option, value in (("thresholds", chosen.thresholds), ("binning", chosen.binning)):
@@ -128,8 +120,7 @@ def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tu
     if not method.networks:
         if chosen.weights is not None:
             raise ValueError(f"--weights: {method.name} has no weights; leave it out")
-        turns = f", {setup.rotation.rate_hz:g} turns/s" if setup.rotation else ""
-        return method.open(setup), f"{method.name}{turns}"
+        return method.open(setup), method.name
     weights = chosen.weights or (shipped_weights() if method.shipped else setup.weights)
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):

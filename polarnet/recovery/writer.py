@@ -38,6 +38,7 @@ from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
+OUTPUTS = ("zarr", "png", "mp4")
 VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
@@ -77,7 +78,7 @@ class _Sample:
 class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` is a subset of zarr, png and mp4. The folder gets recovered.zarr, png/*.png and recovered.mp4
+    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr, png/*.png and recovered.mp4
     (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png,
     the video's picture of the last frame.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows

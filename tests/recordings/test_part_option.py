@@ -45,8 +45,8 @@ def test_the_folder_of_a_bag_is_a_recording(folder, command):
 
 
 def test_the_folder_of_a_bag_is_read_behind_a_rotating_polarizer(folder):
-    assert main(["recover", "one", "--rotating", "50", "--height", "12", "--write", "zarr", "--out", "out"]) == 0
-    assert json.loads((folder / "out" / "run.json").read_text())["command"] == "polarnet recover"
+    assert main(["recover-rotating", "one", "--rate", "50", "--height", "12", "--out", "out"]) == 0
+    assert json.loads((folder / "out" / "run.json").read_text())["command"] == "polarnet recover-rotating"
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,6 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
-    (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
     if "cuda:9" in arguments and torch.cuda.is_available():
