@@ -255,16 +255,22 @@ def _recover(command: AddCommand) -> None:
 Writes frames, pictures, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
-- an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
+- an event store
 - a folder of division-of-time captures
 - with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera""",
     )
     add = recover.add_argument
-    add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, a folder, or -")
+    add(
+        "input",
+        nargs="+",
+        type=input_name,
+        metavar="INPUT",
+        help="recordings, an event store, captures, or -",
+    )
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
-    add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
+    add("--sequence", metavar="NAME", help="sequence of an event store with several")
     add(
         "--truth", nargs="?", type=input_name, const=BESIDE, metavar="FRAMES",
         help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",

@@ -235,9 +235,6 @@ FORMS: dict[str, tuple[str, Callable[[Path, Recorded, int | None], None]]] = {
 """Suffix and writer of each file format."""
 
 
-EXPORT_INDEX = "store.json"
-
-
 def export_store(
     store: EventStore, folder: str | os.PathLike[str], form: str, sequences: Sequence[str] | None = None
 ) -> None:
@@ -269,7 +266,7 @@ def export_store(
         "duration_us": {sequence: store.duration_us(sequence) for sequence in chosen},
         "attributes": store.attributes,
     }
-    (folder / EXPORT_INDEX).write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
+    (folder / "store.json").write_text(json.dumps(contents, indent=2) + "\n", encoding="utf-8")
 
 
 def _channel_chunks(store: EventStore, sequence: str, channel: int) -> Iterator[Events]:

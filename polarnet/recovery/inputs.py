@@ -22,9 +22,8 @@ from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
-from polarnet.recordings.writers import EXPORT_INDEX
 from polarnet.recovery.stream import Input
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, stokes_from_polarization
+from polarnet.stokes import Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import METADATA, unknown_sequence
 
@@ -41,7 +40,7 @@ class Files:
     """Polarizer angle of each of four files, in degrees and in the order of the files."""
     mosaic: Mosaic | None = None
     sequence: str | None = None
-    """Sequence to read from an event store or a folder that holds several."""
+    """Sequence to read from an event store that holds several."""
     open: Open = open_recording
     captures: RecordingsConfig | None = None
     """Settings of division-of-time captures; needed for a folder of them."""
@@ -50,10 +49,9 @@ class Files:
 def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
     """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
-    Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, a folder
-    that `polarnet convert` wrote, or a folder of division-of-time captures, which are calibrated in `work`, a folder
-    without other targets. `clean` removes noise before the size is reduced. A ValueError or FileNotFoundError says what
-    is missing.
+    Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, or a
+    folder of division-of-time captures, which are calibrated in `work`, a folder without other targets. `clean` removes
+    noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
     """
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
@@ -154,11 +152,13 @@ def _channels(files: Files, work: Path) -> Channels:
         return open_mosaic(path, files.mosaic, files.open)
     if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
         return _captured(path, work, files.captures)
-    if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return open_four(exported, files.open, origin_us=0)  # times count from the sequence's start
     if (path / METADATA).is_file():
         store = EventStore.open(path)
-        return _stored(store, _named(files.sequence, store.sequences, path.name))
+        if files.sequence is None and len(store.sequences) == 1:
+            return _stored(store, store.sequences[0])
+        if files.sequence not in store.sequences:
+            raise ValueError(f"{path.name}: --sequence: {unknown_sequence(files.sequence, store.sequences)}")
+        return _stored(store, files.sequence)
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
         f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
@@ -175,31 +175,6 @@ def _stored(store: EventStore, sequence: str) -> Channels:
             yield store.read(sequence, start_us, stop_us)
 
     return Channels(store.height, store.width, blocks, origin_us=0)
-
-
-def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
-    if (folder / EXPORT_INDEX).is_file():
-        names = sorted(path.name for path in folder.iterdir() if path.is_dir())
-        folder = folder / _named(sequence, names, folder.name)
-    files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
-    if not all(files.values()):
-        return {}
-    if several := next((paths for paths in files.values() if len(paths) > 1), None):
-        raise ValueError(
-            f"{folder}: expected one file for each polarizer, got {', '.join(path.name for path in several)}; "
-            f"name the four files, with --angles 0 45 90 135"
-        )
-    return {angle: path for angle, (path,) in files.items()}
-
-
-def _named(sequence: str | None, names: list[str], where: str) -> str:
-    """The sequence of that name, or the only one; ValueError if there is none."""
-    if sequence is None and len(names) == 1:
-        return names[0]
-    if sequence is None or sequence not in names:
-        raise ValueError(f"{where}: --sequence: {unknown_sequence(sequence, names)}")
-    return sequence
 
 
 def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Channels:
