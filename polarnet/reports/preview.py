@@ -1,7 +1,4 @@
-"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4.
-
-`plot_prediction` returns a picture that a notebook shows and that `save` writes.
-"""
+"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -29,7 +26,7 @@ from polarnet.reports.maps import (
     intensity_image,
     polarization_hsv,
 )
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
+from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.frames import Polarization
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
@@ -208,25 +205,6 @@ def foot_of(span_us: tuple[int, int], count: int) -> str:
     """Line of text below a picture: the time span of its events, their number, and their colours."""
     start, stop = (time / 1000 for time in span_us)
     return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
-
-
-def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = None) -> Image.Image:
-    """DoLP, AoLP and the expected error of one predicted frame, with the true `dolp` and the error if it is given.
-
-    >>> import torch
-    >>> from polarnet.reports import plot_prediction
-    >>> from polarnet.stokes import Prediction
-    >>> plot_prediction(Prediction(torch.rand(20, 30)), torch.rand(20, 30)).mode
-    'RGB'
-    """
-    captioned = {"DoLP": dolp_image(prediction.dolp)}
-    if prediction.aolp is not None:
-        captioned["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
-    if prediction.log_variance is not None:
-        captioned["expected error"] = dolp_image(torch.exp(prediction.log_variance / 2))
-    if dolp is not None:
-        captioned |= {"true DoLP": dolp_image(dolp), "error": dolp_image((prediction.dolp - dolp).abs())}
-    return Image.fromarray(Sheet(*prediction.dolp.shape).picture([captioned], ""))
 
 
 @functools.lru_cache(maxsize=64)
