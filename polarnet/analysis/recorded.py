@@ -17,7 +17,7 @@ from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
 from polarnet.recordings.recording import detect_format, read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.truth import Truth, read_truth, truth_formats
+from polarnet.recordings.truth import Truth, check_size, read_truth, truth_formats
 from polarnet.stokes import Mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
@@ -87,11 +87,7 @@ def read_recorded(path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning) -> 
     three remain, as with different clocks, or if frames and sensor differ in size.
     """
     events, truth = read_recording(path).events, read_truth(path, mosaic)
-    if truth.light.shape[1:] != (events.height // 2 * 2, events.width // 2 * 2):
-        raise RecordingError(
-            f"{path.name}: expected frames of the sensor's {events.height}x{events.width} px, got "
-            f"{truth.light.shape[1]}x{truth.light.shape[2]}"
-        )
+    check_size(path, truth, events.height, events.width)
     first_us, last_us = (int(events.t[0]), int(events.t[-1])) if len(events) else (0, 0)
     interval_us = int(np.median(np.diff(truth.t_us))) if len(truth.t_us) > 1 else 0
     during = (truth.t_us >= first_us - interval_us) & (truth.t_us <= last_us + interval_us)

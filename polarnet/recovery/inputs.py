@@ -21,7 +21,7 @@ from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.truth import read_truth
+from polarnet.recordings.truth import check_size, read_truth
 from polarnet.recovery.stream import Input
 from polarnet.stokes import Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
@@ -77,11 +77,7 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
     RecordingError for a file without events, of another format than those with frames, or without frames.
     """
     truth, reader = read_truth(path, mosaic), open_file(path)
-    if truth.dolp.shape[1:] != (reader.height // 2, reader.width // 2):
-        height, width = truth.light.shape[1:]
-        raise RecordingError(
-            f"{path.name}: expected frames of the sensor's {reader.height}x{reader.width} px, got {height}x{width}"
-        )
+    check_size(path, truth, reader.height, reader.width)
     first = next(iter(reader), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")

@@ -1,4 +1,4 @@
-"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4."""
+"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and MP4 videos of them."""
 
 import functools
 from collections.abc import Mapping, Sequence
