@@ -24,8 +24,9 @@ from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import Files, open_files, open_frames, open_live
-from polarnet.recovery.stream import ChosenMethod, Input, TruthScores, frames_of, open_method, recover
+from polarnet.recovery.stream import Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
+from polarnet.runtime.machine import precision_on
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
@@ -49,11 +50,13 @@ def run(options: argparse.Namespace) -> None:
     config = load(settings_root(), [f"runtime.device={options.device}"])
     setup = functools.partial(setup_of, config)
     rule = WindowRule(*parse_window(options.window or NETWORK_WINDOW), duration_us(options, "step", "0.1ms"))
-    method = options.method or _network_method(options, setup)
+    method = METHODS[options.method or _network_method(options, setup)]
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     frames = _frames_of(options, mosaic)
-    settings = options.weights, options.precision, options.thresholds, options.binning, frames
-    recoverer, words = open_method(ChosenMethod(method, *settings), setup)
+    own = setup(method)
+    own = replace(own, precision=precision_on(own.device, options.precision), frames=frames)
+    settings = {"thresholds": options.thresholds, "binning": options.binning}
+    recoverer, words = open_method(method, own, options.weights, settings)
     truth = _truth_of(options)
     scores = TruthScores(truth) if truth else None
     first = Path(options.input[0])

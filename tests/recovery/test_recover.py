@@ -1,4 +1,3 @@
-import functools
 import io
 import itertools
 import re
@@ -14,12 +13,13 @@ from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
+from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks import load_network, shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
 from polarnet.recovery.inputs import Files, open_files
-from polarnet.recovery.stream import ChosenMethod, frames_of, open_method
+from polarnet.recovery.stream import frames_of, open_method
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -224,12 +224,12 @@ def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, ca
 
 
 def test_the_shipped_network_takes_the_thresholds_of_the_camera_and_other_methods_do_not(project_root):
-    setup_of_demo = functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
+    config, highpass, ours = load(project_root, ["runtime.device=cpu"]), METHODS["highpass"], METHODS["ours"]
     for option, value in (("thresholds", (0.1, 0.1)), ("binning", 2)):
         with pytest.raises(ValueError, match=f"--{option} is for the DoLP network, highpass does not use it"):
-            open_method(ChosenMethod("highpass", **{option: value}), setup_of_demo)
+            open_method(highpass, setup_of(config, highpass), settings={option: value})
     windows = [EventWindow([Events.empty(HEIGHT, WIDTH)] * 4, 0, 33_333)]
-    recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
+    recoverer, words = open_method(ours, setup_of(config, ours), settings={"thresholds": (0.1, 0.4)})
     assert words.endswith(str(shipped_weights()))
     assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)
 
