@@ -298,8 +298,8 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network (default: auto)")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
-    formats = ("zarr", "png", "mp4")
-    add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr png mp4)")
+    formats = ("zarr", "mp4")
+    add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr mp4)")
     _video_rate(recover)
     _reading(recover)
 

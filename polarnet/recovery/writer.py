@@ -1,7 +1,7 @@
-"""Write the results of `polarnet recover`: numbers (Zarr), pictures (PNG), a video, and a page.
+"""Write the results of `polarnet recover`: numbers (Zarr), a video, and a page.
 
-A picture shows DoLP, AoLP and the events of the window side by side. The video's pictures are labelled and also show
-polarization with the reconstructed S0. Everything is written as frames arrive, in constant memory.
+The video shows the events of each window, DoLP, AoLP, and polarization with the reconstructed S0. Everything is written
+as frames arrive, in constant memory.
 """
 
 import shutil
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -30,7 +29,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_player
-from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of, with_even_sides
+from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
@@ -38,12 +37,11 @@ from polarnet.storage.groups import GrowingColumns
 from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
-OUTPUTS = ("zarr", "png", "mp4")
+OUTPUTS = ("zarr", "mp4")
 VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
-GAP = 4  # pixels between the maps of a picture
 DOLP, ANGLE, EVENTS = "DoLP", "AoLP (hue), DoLP (saturation)", "events"  # captions
 RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
@@ -78,7 +76,7 @@ class _Sample:
 class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr, png/*.png and recovered.mp4
+    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr and recovered.mp4
     (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png,
     the video's picture of the last frame.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
@@ -107,8 +105,6 @@ class RecoveryWriter:
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()
         folder.mkdir(parents=True, exist_ok=True)
-        if "png" in outputs:
-            (folder / "png").mkdir(exist_ok=True)
 
     def __enter__(self) -> "RecoveryWriter":
         return self
@@ -147,7 +143,7 @@ class RecoveryWriter:
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
         sampled = number % self._sample.every == 0
-        if not (sampled or {"mp4", "png"} & set(self.outputs)):
+        if not (sampled or "mp4" in self.outputs):
             return
         events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
         maps = _coloured(prediction, event_image(events, self._scale.after(events)))
@@ -157,8 +153,6 @@ class RecoveryWriter:
         if sampled:
             true = None if self._truth is None else self._truth.at(window.stop_us)
             self._sample.offer(Picture(window.stop_us, _byte_maps(events, prediction, true)))
-        if "png" in self.outputs:
-            _write_png(self.folder / "png" / f"{number:06d}.png", _side_by_side(maps))
 
     def _labelled(self, window: EventWindow, prediction: Prediction, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
@@ -204,11 +198,6 @@ def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Cap
     return maps | {EVENTS: events}
 
 
-def _side_by_side(maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
-    gap = np.full((maps[EVENTS].shape[0], GAP, 3), 255, np.uint8)
-    return with_even_sides(np.concatenate([part for one in maps.values() for part in (one, gap)][:-1], axis=1))
-
-
 def _quantised(values: Tensor, largest: int) -> np.ndarray:
     return values.round().clamp(0, largest).numpy().astype(np.uint16)
 
@@ -235,10 +224,3 @@ def _film(source: str, pictures: Sequence[Picture]) -> Film:
     names = [name for name in pictures[0].maps if all(name in one.maps for one in pictures)]
     maps = [Map(*name, torch.stack([one.maps[name] for one in pictures]).numpy()) for name in names]
     return Film(source, [one.t_us for one in pictures], maps)
-
-
-def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a PNG without compression or filters, which cost more: thousands are written while a camera runs."""
-    how = [cv2.IMWRITE_PNG_COMPRESSION, 0, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
-    _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), how)
-    path.write_bytes(data.data)

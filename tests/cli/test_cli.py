@@ -97,7 +97,7 @@ def test_an_input_that_does_not_exist_is_refused_before_any_library_is_imported(
     [
         ("recovr x", "'benchmark'); did you mean 'recover'? (see polarnet --help)"),
         ("recover x --mosiac 1", "unrecognized arguments: --mosiac 1; did you mean '--mosaic'? (see polarnet recover"),
-        ("recover x --write pgn", "did you mean 'png'?"),
+        ("recover x --write mp3", "did you mean 'mp4'?"),
         ("recover x --zzz", "unrecognized arguments: --zzz (see polarnet recover --help)"),
     ],
 )

@@ -158,16 +158,16 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
 def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
     out, arguments = tmp_path / "out", ("recover", str(store), "--sequence", "lake", "--method", "highpass")
     arguments = (*arguments, "--out", str(out), "--write")
-    assert main([*arguments, "png", "mp4", "--window", "10ms"]) == 0
-    assert len(list((out / "png").iterdir())) == 10
-    assert main([*arguments, "png", "--window", "50ms"]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["index.html", "png", "recovered.png", "run.json"]
-    assert len(list((out / "png").iterdir())) == 2
+    assert main([*arguments, "zarr", "mp4", "--window", "10ms"]) == 0
+    assert len(recovered(out)["t_us"]) == 10
+    assert main([*arguments, "zarr", "--window", "50ms"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["index.html", "recovered.png", "recovered.zarr", "run.json"]
+    assert len(recovered(out)["t_us"]) == 2
     assert f"page        {out / 'index.html'}" in capsys.readouterr().out
-    assert main([*arguments, "png", "--window", "1s"]) == 1
-    assert len(list((out / "png").iterdir())) == 2
+    assert main([*arguments, "zarr", "--window", "1s"]) == 1
+    assert len(recovered(out)["t_us"]) == 2
     (tmp_path / "out" / "run.json").unlink()
-    assert main([*arguments, "png", "--window", "50ms"]) == 1
+    assert main([*arguments, "zarr", "--window", "50ms"]) == 1
     assert "contains files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
 
 
