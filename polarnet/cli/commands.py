@@ -256,7 +256,6 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
 - an event store
-- a folder of division-of-time captures
 - with --live, a growing file or standard input (-) with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera""",
     )
@@ -266,7 +265,7 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
         nargs="+",
         type=input_name,
         metavar="INPUT",
-        help="recordings, an event store, captures, or -",
+        help="recordings, an event store, or -",
     )
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")

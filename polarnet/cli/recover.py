@@ -9,11 +9,11 @@ from pathlib import Path
 
 from polarnet.cli.commands import BESIDE
 from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, reading_of, refuse
-from polarnet.cli.outputs import WORK, run_folder
+from polarnet.cli.outputs import run_folder
 from polarnet.cli.project import settings_root
 from polarnet.cli.stores import is_store
 from polarnet.config.pipeline import setup_of
-from polarnet.config.tree import Config, load
+from polarnet.config.tree import load
 from polarnet.events.streaming import WindowRule, parse_window
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup, why_absent
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
     with run_folder(out, "recover") as folder:
         if options.live:
             print(f"writing frames to {folder}; the folder becomes {out} at the end", file=sys.stderr)
-        source = _input(options, mosaic, cleaner, folder / WORK, config)
+        source = _input(options, mosaic, cleaner)
         check = ChannelCheck(source.height, source.width, mosaic=mosaic is not None)
         source = source._replace(pieces=check.watch(source.pieces))
         drawn = "mp4" in options.write and truth is None
@@ -114,14 +114,14 @@ def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Se
     return PAST_METHOD if other else WHOLE_METHOD
 
 
-def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner, work: Path, config: Config) -> Input:
+def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner) -> Input:
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
         return open_live(options.input[0], mosaic, options.idle, cleaner)
     open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
-    files = Files(paths, options.angles, mosaic, options.sequence, open_file, config.recordings)
-    return open_files(files, work, options.size, cleaner)
+    files = Files(paths, options.angles, mosaic, options.sequence, open_file)
+    return open_files(files, options.size, cleaner)
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:

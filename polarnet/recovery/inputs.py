@@ -1,4 +1,4 @@
-"""Inputs of `polarnet recover`: files in any arrangement of polarizers, stores, folders of captures, live input."""
+"""Inputs of `polarnet recover`: files in any arrangement of polarizers, stores, live input."""
 
 import itertools
 import math
@@ -11,8 +11,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.targets import calibrate_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events, downscale
 from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, open_mosaic, open_plain
@@ -42,21 +40,18 @@ class Files:
     sequence: str | None = None
     """Sequence to read from an event store that holds several."""
     open: Open = open_recording
-    captures: RecordingsConfig | None = None
-    """Settings of division-of-time captures; needed for a folder of them."""
 
 
-def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
+def open_files(files: Files, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
     """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
-    Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, or a
-    folder of division-of-time captures, which are calibrated in `work`, a folder without other targets. `clean` removes
-    noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
+    Four files hold one channel each. A single path is a recording of a camera with a mosaic, or an event store. `clean`
+    removes noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
     """
     missing = [str(path) for path in files.paths if not path.exists()]
     if missing:
         raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
-    return _input(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
+    return _input(", ".join(path.name for path in files.paths), _channels(files), size, clean)
 
 
 def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:
@@ -136,7 +131,7 @@ def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Ite
         yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
 
 
-def _channels(files: Files, work: Path) -> Channels:
+def _channels(files: Files) -> Channels:
     if len(files.paths) == 4:
         if files.angles is None:
             raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
@@ -146,8 +141,6 @@ def _channels(files: Files, work: Path) -> Channels:
     (path,) = files.paths
     if files.mosaic is not None:
         return open_mosaic(path, files.mosaic, files.open)
-    if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
-        return _captured(path, work, files.captures)
     if (path / METADATA).is_file():
         store = EventStore.open(path)
         if files.sequence is None and len(store.sequences) == 1:
@@ -157,7 +150,7 @@ def _channels(files: Files, work: Path) -> Channels:
         return _stored(store, files.sequence)
     raise ValueError(
         f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, ..."
+        f"'90 45 / 135 0', or give four files with --angles, or an event store"
     )
 
 
@@ -171,17 +164,6 @@ def _stored(store: EventStore, sequence: str) -> Channels:
             yield store.read(sequence, start_us, stop_us)
 
     return Channels(store.height, store.width, blocks, origin_us=0)
-
-
-def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Channels:
-    if config is None:
-        raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
-    root = work / "targets"
-    root.mkdir(parents=True)
-    target = root / folder.resolve().name
-    target.symlink_to(folder.resolve(), target_is_directory=True)
-    calibrate_targets(root, work / "calibrated", config, {})
-    return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:

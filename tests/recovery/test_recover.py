@@ -38,8 +38,7 @@ def write_lines(path, events):
 
 
 def opened(store, size=None):
-    """A sequence of a store, for which neither settings nor a folder are needed."""
-    return open_files(Files([store], sequence="lake"), store / "unused", size)
+    return open_files(Files([store], sequence="lake"), size)
 
 
 def recovered(out):
