@@ -11,15 +11,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.analysis.conditions import conditions, sentence, warnings
-from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import available, metadata_used, weights_used
+from polarnet.benchmark.rows import available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.cli.options import CLEANING, cleaning_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root, working_folder
+from polarnet.cli.recorded import make_recorded_set
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
@@ -79,11 +78,10 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     work = options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
-            used = conditions(config.synthesize, config.emulate)
-            about, differences = sentence(used), warnings(used, metadata_used(methods, context))
-            print("\n".join([about, *(f"WARNING: {line}" for line in differences)]), flush=True)
-            print("simulating the scenes; the first run also compiles the simulation", flush=True)
-            notes = [*differences, *_make_scenes(options, config, root, work)]
+            used = {name: dataclasses.asdict(getattr(config, name)) for name in ("synthesize", "emulate")}
+            about = _sequences_in_words(config)
+            print(about, "simulating the scenes; the first run also compiles the simulation", sep="\n", flush=True)
+            notes = _make_scenes(options, config, root, work)
         else:
             used, about = {}, RECORDED_SENTENCE
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
@@ -110,6 +108,13 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         write_benchmark(folder, benchmark, settings, config.seed, details)
         write_set_page(folder, test_set.name, options.command_line, notes)
     return notes
+
+
+def _sequences_in_words(config: Config) -> str:
+    motion = config.synthesize
+    size = f"{motion.sensor_height}x{motion.sensor_width} pixels (height x width)"
+    pace = f"{motion.duration_s:g} s at {motion.frame_rate_hz:g} frames a second"
+    return f"Sequences of {size}, {pace}; sensor: model {config.emulate.model}."
 
 
 def _lpips(config: Config) -> tuple[Lpips | None, list[str]]:

@@ -7,8 +7,8 @@ import pytest
 import torch
 import zarr
 
-from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main
+from polarnet.cli.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events, merge
