@@ -28,13 +28,12 @@ from polarnet.reports.maps import (
     event_image,
     polarization_hsv,
 )
-from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_player
+from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map, write_player
 from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
 from polarnet.storage.groups import GrowingColumns
-from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
 OUTPUTS = ("zarr", "mp4")
@@ -206,17 +205,15 @@ def _byte_maps(
     events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
 ) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
     """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
-    maps: dict[tuple[str, Kind], Tensor] = {("Events", "events"): signed_bytes(events)}
+    values: dict[tuple[str, Kind], Tensor] = {("Events", "events"): events}
     if true is not None:
-        maps |= {
-            (TRUTH, "s0"): fraction_bytes(true.s0),
-            (TRUTH, "aolp"): angle_bytes(true.aolp),
-            (TRUTH, "dolp"): fraction_bytes(true.dolp),
-        }
-    if prediction.intensities is not None and true is None:
-        maps[RECOVERED, "s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
-    maps[RECOVERED, "dolp"] = fraction_bytes(prediction.dolp)
-    return maps if prediction.aolp is None else maps | {(RECOVERED, "aolp"): angle_bytes(prediction.aolp)}
+        values |= {(TRUTH, "s0"): true.s0, (TRUTH, "aolp"): true.aolp, (TRUTH, "dolp"): true.dolp}
+    elif prediction.intensities is not None:
+        values[RECOVERED, "s0"] = prediction.intensities[::2].float().mean(0)
+    values[RECOVERED, "dolp"] = prediction.dolp
+    if prediction.aolp is not None:
+        values[RECOVERED, "aolp"] = prediction.aolp
+    return {name: TO_BYTES[name[1]](one) for name, one in values.items()}
 
 
 def _film(source: str, pictures: Sequence[Picture]) -> Film:
