@@ -299,7 +299,6 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     formats = ("zarr", "mp4")
     add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr mp4)")
-    _video_rate(recover)
     _reading(recover)
 
 
@@ -319,7 +318,6 @@ def _recover_rotating(command: AddCommand) -> None:
     add("--start-angle", type=float, default=0.0, metavar="DEG", help="at time 0 or the first trigger (default: 0)")
     add("--step", help="time between frames: 10ms (default: half a turn)")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
-    _video_rate(rotating)
     _reading(rotating)
 
 
@@ -412,12 +410,6 @@ def _benchmark(command: AddCommand) -> None:
 
 def _overrides(command: Command) -> None:
     command.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: sensor=noisy seed=2")
-
-
-def _video_rate(command: Command) -> None:
-    command.add_argument(
-        "--video-rate", type=positive, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)"
-    )
 
 
 def _cleaning(command: Command) -> None:

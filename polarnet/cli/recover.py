@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
         source = source._replace(pieces=check.watch(source.pieces))
         drawn = "mp4" in options.write and truth is None
         reconstruct = METHODS[RECONSTRUCT].open(setup(METHODS[RECONSTRUCT])) if drawn else None
-        writer = RecoveryWriter(folder, options.write, options.video_rate, reconstruct, truth)
+        writer = RecoveryWriter(folder, options.write, reconstruct, truth)
         recovered = frames_of(source, rule, recoverer)
         if scores:
             recovered = scores.watch(recovered)

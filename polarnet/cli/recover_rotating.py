@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     recoverer = METHOD.open(replace(setup_of(load(settings_root()), METHOD), rotation=rotation))
     out = options.out or Path("outputs") / "recover" / options.input.name
     with run_folder(out, "recover-rotating") as folder:
-        writer = RecoveryWriter(folder, OUTPUTS, options.video_rate)
+        writer = RecoveryWriter(folder, OUTPUTS)
         words = f"{METHOD.name}, {rotation.rate_hz:g} turns/s"
         facts = recover(source, rule, words, writer, frames_of(source, rule, recoverer))
         notes = damage(source)

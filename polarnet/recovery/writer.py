@@ -29,7 +29,7 @@ from polarnet.reports.maps import (
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map, write_player
-from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of
+from polarnet.reports.preview import PICTURES_PER_SECOND, Captioned, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
@@ -75,9 +75,8 @@ class _Sample:
 class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr and recovered.mp4
-    (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png,
-    the video's picture of the last frame.
+    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr and recovered.mp4 (30 frames a second, whatever
+    the time between them). `write_page` adds index.html and recovered.png, the video's picture of the last frame.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
     polarization at full value. `truth` is shown in the video and on the page beside each frame.
     """
@@ -86,7 +85,6 @@ class RecoveryWriter:
         self,
         folder: Path,
         outputs: Collection[str],
-        video_rate_hz: float,
         reconstruct: Recoverer | None = None,
         truth: TrueFrames | None = None,
     ):
@@ -99,7 +97,7 @@ class RecoveryWriter:
         self._sheet: Sheet | None = None
         self._latest: tuple[EventWindow, Prediction, Captioned] | None = None
         self._arrays = GrowingColumns(folder / "recovered.zarr", FRAMES_PER_CHUNK, False, ZARR_CONVENTIONS)
-        self._video = VideoWriter(folder / VIDEO, video_rate_hz)
+        self._video = VideoWriter(folder / VIDEO, PICTURES_PER_SECOND)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()

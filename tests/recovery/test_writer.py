@@ -35,7 +35,7 @@ def cores(request, monkeypatch):
 
 @pytest.fixture
 def written(tmp_path, cores):
-    with RecoveryWriter(tmp_path, ("zarr", "mp4"), 30.0) as writer:
+    with RecoveryWriter(tmp_path, ("zarr", "mp4")) as writer:
         for k in range(FRAMES):
             writer.add(window(k), frame(k), live=True)
     writer.write_page("a & b", {"windows": "of 1 ms"}, ["one note"])
@@ -64,7 +64,7 @@ def test_the_numbers_the_video_and_a_page_that_escapes_names_are_written(written
 
 
 def test_without_an_angle_two_maps_are_shown_and_nothing_else_is_written(tmp_path):
-    with RecoveryWriter(tmp_path, ("zarr",), 30.0) as writer:
+    with RecoveryWriter(tmp_path, ("zarr",)) as writer:
         for k in range(3):
             writer.add(window(k), frame(k, angle=False))
     writer.write_page("x", {}, [])
@@ -78,7 +78,7 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     monkeypatch.setattr(recovery.shutil, "disk_usage", lambda _: usage._replace(free=next(free)))
 
     def write() -> None:
-        with RecoveryWriter(tmp_path, ("zarr",), 30.0) as writer:
+        with RecoveryWriter(tmp_path, ("zarr",)) as writer:
             for k in range(FRAMES):
                 writer.add(window(k), frame(k), live=True)
 
