@@ -39,10 +39,6 @@ class RuntimeConfig:
     """Number of processes that share the sequences."""
     devices: Annotated[int, Field(gt=0, le=4096)]
     """Number of processes on this machine that share a training, each on its own GPU, or all on the processor."""
-    nodes: Annotated[int, Field(gt=0, le=4096)]
-    """Number of machines that share a training; the same command starts on each."""
-    rendezvous: str
-    """Address at which the machines meet: host:port of one of them."""
 
 
 def seed_for(seed: int, name: str, purpose: str) -> int:

@@ -16,7 +16,7 @@ import torch
 from polarnet.runtime import machine as runtime
 from polarnet.runtime.machine import RuntimeConfig, device_of, generator_for, keep_freed_memory, precision_on, seed_for
 
-RUNTIME = RuntimeConfig(device="cpu", threads=1, workers=1, devices=1, nodes=1, rendezvous="localhost:29500")
+RUNTIME = RuntimeConfig(device="cpu", threads=1, workers=1, devices=1)
 
 
 def test_a_seed_depends_on_its_three_parts_alone_and_is_pinned_for_ever():

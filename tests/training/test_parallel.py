@@ -31,7 +31,7 @@ time.sleep(600)
 START = """
 from types import SimpleNamespace
 from polarnet.training.engine.parallel import launched
-launched("asleep", SimpleNamespace(devices=2, nodes=1))
+launched("asleep", SimpleNamespace(devices=2))
 """
 CONFIG = dataclasses.replace(TRAIN, batch_size=5)  # of six visits: one process has nothing of the last batch
 

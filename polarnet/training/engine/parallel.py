@@ -21,12 +21,9 @@ def launched(module: str, runtime: RuntimeConfig) -> bool:
 
     Returns False without starting anything if one process is enough or if torchrun started this process.
     """
-    if "WORLD_SIZE" in os.environ or runtime.devices * runtime.nodes == 1:
+    if "WORLD_SIZE" in os.environ or runtime.devices == 1:
         return False
-    meeting = ["--standalone"]
-    if runtime.nodes > 1:
-        meeting = ["--rdzv-backend=c10d", f"--rdzv-endpoint={runtime.rendezvous}"]
-    torchrun = ["torch.distributed.run", f"--nnodes={runtime.nodes}", f"--nproc-per-node={runtime.devices}", *meeting]
+    torchrun = ["torch.distributed.run", "--standalone", f"--nproc-per-node={runtime.devices}"]
     command = [sys.executable, "-m", *torchrun, "-m", module, *sys.argv[1:]]
     status = subprocess.run(command, preexec_fn=functools.partial(end_with_parent, os.getpid())).returncode
     if status:
