@@ -46,11 +46,8 @@ def open_files(files: Files, size: Sequence[int] | None = None, clean: Cleaner |
     """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
 
     Four files hold one channel each. A single path is a recording of a camera with a mosaic, or an event store. `clean`
-    removes noise before the size is reduced. A ValueError or FileNotFoundError says what is missing.
+    removes noise before the size is reduced. A ValueError says what is missing.
     """
-    missing = [str(path) for path in files.paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
     return _input(", ".join(path.name for path in files.paths), _channels(files), size, clean)
 
 
@@ -92,10 +89,8 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -
         reader = LiveCamera(path, mosaic, idle_s)
     elif path == STANDARD_INPUT:
         reader = LiveLines(sys.stdin.buffer, "standard input", mosaic, idle_s)
-    elif Path(path).is_file():
-        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic, idle_s)  # noqa: SIM115 - read until the end
     else:
-        raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
+        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic, idle_s)  # noqa: SIM115 - read until the end
     pieces = clean.clean(reader, live=True)
     repairs = {reader.name: reader.counts}
     return Input(reader.name, reader.height, reader.width, pieces, repairs, live=True, waits=reader.waits)
