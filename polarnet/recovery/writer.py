@@ -8,7 +8,6 @@ import shutil
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,15 +20,13 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
 from polarnet.reports.maps import (
-    EventScale,
     angle_image,
     dolp_image,
     encode_png,
-    event_image,
     polarization_hsv,
 )
 from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map, write_player
-from polarnet.reports.preview import PICTURES_PER_SECOND, Captioned, Sheet, VideoWriter, foot_of
+from polarnet.reports.preview import PICTURES_PER_SECOND, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import FRAMES_PER_CHUNK, Polarization
@@ -41,7 +38,7 @@ VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
-DOLP, ANGLE, EVENTS = "DoLP", "AoLP (hue), DoLP (saturation)", "events"  # captions
+ANGLE = "AoLP (hue), DoLP (saturation)"  # caption
 RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, end of its window, microseconds from the first event",
@@ -57,19 +54,6 @@ class Picture(NamedTuple):
     t_us: int
     maps: Mapping[tuple[str, Kind], UInt8[Tensor, "h w"]]
     """The maps as bytes (`polarnet.storage.panels`) by source and kind, for the page."""
-
-
-@dataclass
-class _Sample:
-    """A sample of the pictures, evenly spread over a stream of unknown length."""
-
-    pictures: list[Picture]
-    every: int = 1
-
-    def offer(self, picture: Picture) -> None:
-        self.pictures.append(picture)
-        if len(self.pictures) > 2 * MAX_FRAMES:
-            self.pictures, self.every = self.pictures[::2], 2 * self.every
 
 
 class RecoveryWriter:
@@ -92,10 +76,10 @@ class RecoveryWriter:
         self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
         self.frames = self.stop_us = 0
-        self._sample = _Sample([])
-        self._scale = EventScale()
+        self._pictures: list[Picture] = []  # evenly spread over a stream of unknown length
+        self._every = 1
         self._sheet: Sheet | None = None
-        self._latest: tuple[EventWindow, Prediction, Captioned] | None = None
+        self._latest: tuple[EventWindow, Prediction, Float[Tensor, "h w"]] | None = None
         self._arrays = GrowingColumns(folder / "recovered.zarr", FRAMES_PER_CHUNK, False, ZARR_CONVENTIONS)
         self._video = VideoWriter(folder / VIDEO, PICTURES_PER_SECOND)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
@@ -123,12 +107,11 @@ class RecoveryWriter:
 
     def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""
-        pictures = self._sample.pictures
-        if self._latest is not None:
-            (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
-        video = VIDEO if "mp4" in self.outputs and self.frames else None
-        films = [_film(source, pictures)] if pictures else []
-        return write_player(self.folder / "index.html", f"DoLP from events: {source}", films, facts, notes, video)
+        assert self._latest is not None, "a recovery has at least one frame"
+        (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
+        films, title = [_film(source, self._pictures)], f"DoLP from events: {source}"
+        video = VIDEO if "mp4" in self.outputs else None
+        return write_player(self.folder / "index.html", title, films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
         while len(self._waiting) > most:
@@ -139,29 +122,32 @@ class RecoveryWriter:
             raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
-        sampled = number % self._sample.every == 0
+        sampled = number % self._every == 0
         if not (sampled or "mp4" in self.outputs):
             return
         events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
-        maps = _coloured(prediction, event_image(events, self._scale.after(events)))
-        self._latest = window, prediction, maps
+        self._latest = window, prediction, events
         if "mp4" in self.outputs:
-            self._video.add(self._labelled(window, prediction, maps))
+            self._video.add(self._labelled(window, prediction, events))
         if sampled:
             true = None if self._truth is None else self._truth.at(window.stop_us)
-            self._sample.offer(Picture(window.stop_us, _byte_maps(events, prediction, true)))
+            self._pictures.append(Picture(window.stop_us, _byte_maps(events, prediction, true)))
+            if len(self._pictures) > 2 * MAX_FRAMES:
+                self._pictures, self._every = self._pictures[::2], 2 * self._every
 
-    def _labelled(self, window: EventWindow, prediction: Prediction, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def _labelled(
+        self, window: EventWindow, prediction: Prediction, events: Float[Tensor, "h w"]
+    ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        above, below = {name: maps[name] for name in (EVENTS, DOLP)}, {}
+        above, below = {"events": self._sheet.events(events[None])[0], "DoLP": dolp_image(prediction.dolp)}, {}
         true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
             s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
             if s0 is not None:
                 below[f"polarization, {kind} S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
-            below[ANGLE] = maps[ANGLE]
+            below[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
         if true:
             above["true DoLP"] = dolp_image(true.dolp)
             below[f"true {ANGLE}"] = angle_image(true.dolp, true.aolp)
@@ -185,14 +171,6 @@ class RecoveryWriter:
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         self._arrays.add(frame)
-
-
-def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Captioned:
-    """The maps of a frame as pictures, by caption."""
-    maps = {DOLP: dolp_image(prediction.dolp)}
-    if prediction.aolp is not None:
-        maps[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
-    return maps | {EVENTS: events}
 
 
 def _quantised(values: Tensor, largest: int) -> np.ndarray:

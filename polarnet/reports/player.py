@@ -119,7 +119,7 @@ def write_player(
     video: str | None = None,
 ) -> Path:
     """Write a page with the player, and below it `facts`; `video` names a file beside the page."""
-    player = embedded_json(player_data(films)) if films else None
+    player = embedded_json(player_data(films))
     page = template("viewer.html.jinja").render(
         title=title, player_json=player, facts=facts, notes=notes, video=video, script=script
     )
