@@ -32,7 +32,7 @@ def _findings() -> Iterator[tuple[str, str]]:
     yield "threads", f"{usable_cores()} cores, torch uses {torch.get_num_threads()}"
     yield "bf16", units or "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
     for backbone in BACKBONES:
-        yield "LPIPS", _or_error(functools.partial(_lpips, backbone))
+        yield "LPIPS", f"{backbone}: {_or_error(functools.partial(installed_version, backbone))}"
     file = shipped_weights()
     digest = sha256(file)[:12]
     yield "weights", _or_error(lambda: f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {digest})")
@@ -47,10 +47,6 @@ def _or_error(finding: Callable[[], str]) -> str:
         return finding()
     except (ValueError, FileNotFoundError) as error:
         return str(error)
-
-
-def _lpips(backbone: str) -> str:
-    return f"{backbone}: {installed_version(backbone)}"
 
 
 def _extra(extra: str) -> str:
