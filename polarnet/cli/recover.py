@@ -23,7 +23,7 @@ from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
-from polarnet.recovery.inputs import Files, open_files, open_frames, open_live
+from polarnet.recovery.inputs import input_of, open_channels, open_frames, open_live
 from polarnet.recovery.stream import Input, TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import precision_on
@@ -120,8 +120,8 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner)
         return open_live(options.input[0], mosaic, options.idle, cleaner)
     open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
-    files = Files(paths, options.angles, mosaic, options.sequence, open_file)
-    return open_files(files, options.size, cleaner)
+    channels = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
+    return input_of(", ".join(path.name for path in paths), channels, options.size, cleaner)
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:

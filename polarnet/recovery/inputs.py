@@ -4,7 +4,6 @@ import itertools
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,26 +28,65 @@ STANDARD_INPUT = "-"
 STEPS_PER_BLOCK = 64  # steps of the store's index, 2**14 events each
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files to recover, and the arrangement of their polarizers, as the user gives them."""
+def open_channels(
+    paths: Sequence[Path],
+    angles: Sequence[int] | None = None,
+    mosaic: Mosaic | None = None,
+    sequence: str | None = None,
+    open_file: Open = open_recording,
+) -> Channels:
+    """The four channels in files, starting at time 0; a ValueError says what is missing.
 
-    paths: Sequence[Path]
-    angles: Sequence[int] | None = None
-    """Polarizer angle of each of four files, in degrees and in the order of the files."""
-    mosaic: Mosaic | None = None
-    sequence: str | None = None
-    """Sequence to read from an event store that holds several."""
-    open: Open = open_recording
-
-
-def open_files(files: Files, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
-    """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
-
-    Four files hold one channel each. A single path is a recording of a camera with a mosaic, or an event store. `clean`
-    removes noise before the size is reduced. A ValueError says what is missing.
+    Four files hold one channel each, behind polarizers at `angles`, in degrees and in the order of the files. A single
+    path is a recording of a camera with a `mosaic`, or an event store, of which `sequence` is read.
     """
-    return _input(", ".join(path.name for path in files.paths), _channels(files), size, clean)
+    if len(paths) == 4:
+        if angles is None:
+            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
+        return open_four(dict(zip(angles, paths, strict=True)), open_file)
+    if len(paths) != 1 or angles is not None:
+        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(paths)}")
+    (path,) = paths
+    if mosaic is not None:
+        return open_mosaic(path, mosaic, open_file)
+    if not (path / METADATA).is_file():
+        raise ValueError(
+            f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
+            f"'90 45 / 135 0', or give four files with --angles, or an event store"
+        )
+    store = EventStore.open(path)
+    name = store.sequences[0] if sequence is None and len(store.sequences) == 1 else sequence
+    if name not in store.sequences:
+        raise ValueError(f"{path.name}: --sequence: {unknown_sequence(name, store.sequences)}")
+    return _stored(store, name)
+
+
+def _stored(store: EventStore, sequence: str) -> Channels:
+    """A sequence of a store, in blocks of about a million events."""
+
+    def blocks() -> Iterator[Sequence[Events]]:
+        times = sorted(itertools.chain(*store.record(sequence)["index"]))
+        edges = [0, *sorted(set(times[STEPS_PER_BLOCK::STEPS_PER_BLOCK]) - {0}), None]
+        for start_us, stop_us in itertools.pairwise(edges):
+            yield store.read(sequence, start_us, stop_us)
+
+    return Channels(store.height, store.width, blocks, origin_us=0)
+
+
+def input_of(name: str, channels: Channels, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
+    """Channels as the input of a recovery; `clean` removes noise, then they are reduced to `size` (height, width)."""
+    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
+    pieces = channels if clean is None else clean.clean(channels)
+    height, width = size or (channels.height, channels.width)
+    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
+    return Input(name, height, width, pieces, repairs, channels.number)
+
+
+def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
+    """Pieces with the fewer pixels of `sums`, see `downscale`."""
+    for piece in pieces:
+        both = zip(piece.channels, sums, strict=True)
+        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
 
 
 def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:
@@ -60,11 +98,11 @@ def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Inpu
     first = next(channels.blocks(), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
-    return _input(path.name, channels), rotation.since(int(first[0].t[0]))
+    return input_of(path.name, channels), rotation.since(int(first[0].t[0]))
 
 
 def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
-    """The frames of a recording, whose times count from its first event as those of `open_files` do.
+    """The frames of a recording, whose times count from its first event as those of `open_channels` do.
 
     RecordingError for a file without events, of another format than those with frames, or without frames.
     """
@@ -109,56 +147,6 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
     if rate_hz is None:
         raise ValueError("expected the rate of the polarizer (--rate HZ) or its triggers (--triggers FILE)")
     return steady_rotation(rate_hz, start_angle)
-
-
-def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
-    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
-    pieces = channels if clean is None else clean.clean(channels)
-    height, width = size or (channels.height, channels.width)
-    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
-    return Input(name, height, width, pieces, repairs, channels.number)
-
-
-def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
-    """Pieces with the fewer pixels of `sums`, see `downscale`."""
-    for piece in pieces:
-        both = zip(piece.channels, sums, strict=True)
-        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
-
-
-def _channels(files: Files) -> Channels:
-    if len(files.paths) == 4:
-        if files.angles is None:
-            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        return open_four(dict(zip(files.angles, files.paths, strict=True)), open_file=files.open)
-    if len(files.paths) != 1 or files.angles is not None:
-        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
-    (path,) = files.paths
-    if files.mosaic is not None:
-        return open_mosaic(path, files.mosaic, files.open)
-    if (path / METADATA).is_file():
-        store = EventStore.open(path)
-        if files.sequence is None and len(store.sequences) == 1:
-            return _stored(store, store.sequences[0])
-        if files.sequence not in store.sequences:
-            raise ValueError(f"{path.name}: --sequence: {unknown_sequence(files.sequence, store.sequences)}")
-        return _stored(store, files.sequence)
-    raise ValueError(
-        f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, or an event store"
-    )
-
-
-def _stored(store: EventStore, sequence: str) -> Channels:
-    """A sequence of a store, in blocks of about a million events."""
-
-    def blocks() -> Iterator[Sequence[Events]]:
-        times = sorted(itertools.chain(*store.record(sequence)["index"]))
-        edges = [0, *sorted(set(times[STEPS_PER_BLOCK::STEPS_PER_BLOCK]) - {0}), None]
-        for start_us, stop_us in itertools.pairwise(edges):
-            yield store.read(sequence, start_us, stop_us)
-
-    return Channels(store.height, store.width, blocks, origin_us=0)
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:
