@@ -58,9 +58,9 @@ def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleani
         except RecordingError as error:
             notes.append(f"{path.name} was skipped: {str(error).removeprefix(f'{path.name}: ')}.")
     if others:
-        names = ", ".join([*others[:MAX_LISTED], *(["..."] if len(others) > MAX_LISTED else [])])
-        formats = ", ".join(truth_formats())
-        notes.append(f"{len(others)} files of other formats than those with frames, {formats}, were skipped: {names}.")
+        more = f" and {len(others) - MAX_LISTED} more" if len(others) > MAX_LISTED else ""
+        names = f"{', '.join(others[:MAX_LISTED])}{more}"
+        notes.append(f"Skipped, because only files of {', '.join(truth_formats())} hold frames: {names}.")
     if not recordings:
         raise ValueError(f"{root}: no recording with true polarization. {' '.join(notes) or 'The folder is empty.'}")
     sizes = {one.truth.dolp.shape[1:] for one in recordings}
