@@ -19,9 +19,9 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.reports.maps import (
     DOLP_TABLE,
-    EventScale,
     angle_image,
     dolp_image,
+    event_full_scale,
     event_image,
     intensity_image,
     polarization_hsv,
@@ -42,6 +42,7 @@ FONT_SIZE = 13  # pixels
 LINE = 22  # height of a line of text
 BAR = (120, 10)  # width and height of the colour bar of DoLP
 TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
+SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
 
 Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
@@ -110,12 +111,14 @@ class Sheet:
         longer = max(height, width)
         zoom = -(-MIN_PANEL // longer) if longer < MIN_PANEL else min(1.0, MAX_PANEL / longer)
         self._size = round(height * zoom), round(width * zoom)
-        self._scale = EventScale()
+        self._scale: float | None = None
 
     def events(self, sums: Float[Tensor, "n h w"]) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Maps of ON minus OFF events, coloured on one scale."""
-        scale = self._scale.after(sums)
-        return [event_image(image, scale) for image in sums]
+        """Maps of ON minus OFF events, coloured on one scale, which follows the number of events slowly."""
+        present = event_full_scale(sums)
+        inertia = 0.0 if self._scale is None else SCALE_INERTIA
+        self._scale = inertia * (self._scale or 0.0) + (1 - inertia) * present
+        return [event_image(image, self._scale) for image in sums]
 
     def picture(self, rows: Sequence[Captioned], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Rows of captioned maps above a line of text and the colour bar of DoLP, with even sides."""
