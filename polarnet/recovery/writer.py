@@ -19,12 +19,7 @@ from torch import Tensor
 from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
-from polarnet.reports.maps import (
-    angle_image,
-    dolp_image,
-    encode_png,
-    polarization_hsv,
-)
+from polarnet.reports.maps import angle_image, dolp_image, encode_png, polarization_hsv
 from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map, write_player
 from polarnet.reports.preview import PICTURES_PER_SECOND, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
