@@ -4,9 +4,10 @@ import functools
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import zip_longest
 from typing import Any, TypeVar
 
 from polarnet.runtime.machine import end_with_parent, limit_threads, on_one_thread, tune, usable_cores
@@ -82,10 +83,11 @@ def _over_processes(
             f"several processes need semaphores in /dev/shm, which cannot be made there: {error}; run again with "
             "runtime.workers=1"
         ) from error
+    futures: list[Future[Result]] = []
     with executor as pool:
         try:
             with _interrupts_held():  # by the workers too, until they are set up: their imports would show tracebacks
-                futures = [pool.submit(_in_worker, function, item) for item in items]
+                futures += (pool.submit(_in_worker, function, item) for item in items)
             waiting = set(futures)
             while waiting:
                 finished, waiting = wait(waiting, POLL_S, FIRST_EXCEPTION)
@@ -94,11 +96,10 @@ def _over_processes(
                     future.result()
             return [future.result() for future in futures]
         except BrokenProcessPool:
-            undone = [item for item, one in zip(items, futures, strict=True) if not one.done() or one.exception()]
+            undone = [str(item) for item, one in zip_longest(items, futures) if one is None or one.exception()]
             raise RuntimeError(
-                f"{label}: a worker process died (out of memory?) with these undone: "
-                f"{', '.join(map(str, undone[:8]))}; run again, which makes what is missing, with fewer "
-                "runtime.workers if memory is short"
+                f"{label}: a worker process died (out of memory?) with these undone: {', '.join(undone[:8])}; run "
+                "again, which makes what is missing, with fewer runtime.workers if memory is short"
             ) from None
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):

@@ -73,9 +73,10 @@ def test_verify_of_something_else_says_what_was_expected_and_a_name_that_is_not_
 
 
 MISSING = [
-    "recover nofile", "recover . --truth nofile", "inspect nofile", "view nofile", "video nofile", "replay nofile lake",
-    "verify nofile", "simulate nofile seed=2", "convert nofile out.h5", "fit-sensor --name lab --flicker . nofile",
-    "onnx out.onnx --weights nofile", "benchmark --scenes nofile", "benchmark --recordings nofile",
+    "recover nofile", "recover . --truth nofile", "recover-rotating nofile", "inspect nofile", "view nofile",
+    "video nofile", "replay nofile lake", "verify nofile", "simulate nofile seed=2", "convert nofile out.h5",
+    "fit-sensor --name lab --flicker . nofile", "onnx out.onnx --weights nofile", "benchmark --scenes nofile",
+    "benchmark --recordings nofile",
 ]  # fmt: skip
 
 
