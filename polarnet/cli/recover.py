@@ -168,7 +168,5 @@ def check_options(options: argparse.Namespace) -> None:
         raise ValueError(f"--live: expected one input, got {len(options.input)}")
     if not first.is_dir() or is_recording(first):
         refuse(options, "a recording", ["sequence"])
-    elif options.mosaic is not None:
-        refuse(options, "a store", READING)
     else:
         refuse(options, "a store or a folder", ["part", *READING])
