@@ -277,7 +277,6 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent live input has ended (default: 5)")
-    add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
     _cleaning(recover)
     add(
         "--window", help="length: a time (20ms) or events of all channels (20000ev) (default: 33.333ms, as in training)"

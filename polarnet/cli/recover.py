@@ -39,9 +39,8 @@ RECONSTRUCT = "highpass"
 NETWORK_WINDOW = "33.333ms"
 ARRANGEMENTS = ("angles", "mosaic", "sequence")
 """Options that say where the polarizers are."""
-NOT_LIVE = ("angles", "sequence", "truth", "frames", "size", "part", *READING)
+NOT_LIVE = ("angles", "sequence", "truth", "frames", "part", *READING)
 """Options without a meaning for live input."""
-NOT_WITH_FRAMES = ("size", "step")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -121,7 +120,7 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner)
     open_file = functools.partial(open_recording, **reading_of(options))
     paths = [Path(path) for path in options.input]
     channels = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
-    return input_of(", ".join(path.name for path in paths), channels, options.size, cleaner)
+    return input_of(", ".join(path.name for path in paths), channels, cleaner)
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:
@@ -138,8 +137,8 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
     if options.truth is None:
         return None
     path = options.input[0]
-    if options.size or not is_store(path):
-        raise ValueError("--truth: expected an event store in its own size; leave out --truth or --size")
+    if not is_store(path):
+        raise ValueError("--truth: expected an event store; leave out --truth")
     truth = truth_beside(path) if options.truth == BESIDE else options.truth
     if truth is None:
         raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {path}, there is none; name them")
@@ -163,7 +162,7 @@ def check_options(options: argparse.Namespace) -> None:
         if options.method == WHOLE_METHOD:
             raise ValueError(f"--live: {WHOLE_METHOD} waits for the whole recording; use --method {PAST_METHOD}")
     if options.frames:
-        refuse(options, "--frames", NOT_WITH_FRAMES)
+        refuse(options, "--frames", ["step"])
     if options.live and len(options.input) != 1:
         raise ValueError(f"--live: expected one input, got {len(options.input)}")
     if not first.is_dir() or is_recording(first):

@@ -3,16 +3,15 @@
 import itertools
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
-from polarnet.events.stream import Events, downscale
-from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, open_mosaic, open_plain
+from polarnet.events.stream import Events
+from polarnet.recordings.arrangements import Channels, Open, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
@@ -73,20 +72,11 @@ def _stored(store: EventStore, sequence: str) -> Channels:
     return Channels(store.height, store.width, blocks, origin_us=0)
 
 
-def input_of(name: str, channels: Channels, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
-    """Channels as the input of a recovery; `clean` removes noise, then they are reduced to `size` (height, width)."""
+def input_of(name: str, channels: Channels, clean: Cleaner | None = None) -> Input:
+    """Channels as the input of a recovery, from which `clean` removes noise."""
     repairs = {reader.path.name: reader.repairs for reader in channels.readers}
     pieces = channels if clean is None else clean.clean(channels)
-    height, width = size or (channels.height, channels.width)
-    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
-    return Input(name, height, width, pieces, repairs, channels.number)
-
-
-def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
-    """Pieces with the fewer pixels of `sums`, see `downscale`."""
-    for piece in pieces:
-        both = zip(piece.channels, sums, strict=True)
-        yield piece._replace(channels=[downscale(e, *own.shape, keep_rate=True, sums=own) for e, own in both])
+    return Input(name, channels.height, channels.width, pieces, repairs, channels.number)
 
 
 def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:

@@ -44,5 +44,6 @@ def test_truth_scores_a_recovery_and_reaches_its_video(simulated, tmp_path, caps
     assert "AoLP error" in printed
     with av.open(str(tmp_path / "out" / "recovered.mp4")) as file:
         assert next(file.decode(video=0)).width > 700  # three columns of panels
-    assert main([*command[:-2], "--size", "9", "12"]) == 1
-    assert "--truth: expected an event store in its own size" in capsys.readouterr().err
+    (tmp_path / "e.txt").write_text("4 4\n1 2 3 1\n")
+    assert main(["recover", str(tmp_path / "e.txt"), "--mosaic", "90 45 / 135 0", "--method", "cf", "--truth"]) == 1
+    assert "--truth: expected an event store" in capsys.readouterr().err

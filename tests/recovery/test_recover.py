@@ -37,8 +37,8 @@ def write_lines(path, events):
     return path
 
 
-def opened(store, size=None):
-    return input_of("lake", open_channels([store], sequence="lake"), size)
+def opened(store):
+    return input_of("lake", open_channels([store], sequence="lake"))
 
 
 def recovered(out):
@@ -117,10 +117,8 @@ def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_s
         torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
-def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_lines(store, channels):
-    source = opened(store, (8, 10))
-    assert (source.height, source.width) == (8, 10)
-    *_, last = source.pieces
+def test_a_sequence_ends_with_its_last_event_and_is_replayed_as_lines(store, channels):
+    *_, last = opened(store).pieces
     assert last.until_us == DURATION_US
     head, _, lines = live_lines(channels)
     out = io.BytesIO()
@@ -140,7 +138,6 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors: there is no such file"),
-    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
     (("--live", "--method", "cf", "--clock-mhz", 70), "--live: expected no --clock-mhz"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
