@@ -252,7 +252,7 @@ def _recover(command: AddCommand) -> None:
         "recover data/events.zarr --sequence lake-0 --step 1ms --write mp4",
         'recover dv://camera --live --mosaic "90 45 / 135 0"',
         description="""\
-Writes frames, pictures, a video and a page. INPUT is one of:
+Writes the frames as numbers, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
 - an event store
@@ -260,13 +260,7 @@ Writes frames, pictures, a video and a page. INPUT is one of:
 dv://HOST:PORT of a program that streams its events, or dv://camera""",
     )
     add = recover.add_argument
-    add(
-        "input",
-        nargs="+",
-        type=input_name,
-        metavar="INPUT",
-        help="recordings, an event store, or -",
-    )
+    add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, or -")
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
     add("--sequence", metavar="NAME", help="sequence of an event store with several")
