@@ -19,10 +19,10 @@ from polarnet.cli.options import CLEANING, cleaning_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.cli.recorded import make_recorded_set
-from polarnet.config.pipeline import context_of, made_set
+from polarnet.config.pipeline import context_of, lpips_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import Lpips, installed_version, record_of
+from polarnet.metrics.lpips import record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
@@ -65,7 +65,11 @@ def run(options: argparse.Namespace) -> None:
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     source = "--scenes" if options.scenes else "--recordings"
-    lpips, without_lpips = _lpips(config)
+    lpips, without_lpips = None, []
+    try:
+        lpips = lpips_of(config)
+    except ValueError as error:
+        without_lpips = [f"LPIPS was left out: {error}."]
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
     mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
@@ -115,17 +119,6 @@ def _sequences_in_words(config: Config) -> str:
     size = f"{motion.sensor_height}x{motion.sensor_width} pixels (height x width)"
     pace = f"{motion.duration_s:g} s at {motion.frame_rate_hz:g} frames a second"
     return f"Sequences of {size}, {pace}; sensor: model {config.emulate.model}."
-
-
-def _lpips(config: Config) -> tuple[Lpips | None, list[str]]:
-    """Network of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
-    if not config.benchmark.lpips:
-        return None, []
-    try:
-        installed_version(config.benchmark.lpips_backbone)
-    except ValueError as error:
-        return None, [f"LPIPS was left out: {error}."]
-    return Lpips.load(config.benchmark.lpips_backbone), []
 
 
 def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:
