@@ -65,11 +65,12 @@ def run(options: argparse.Namespace) -> None:
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     source = "--scenes" if options.scenes else "--recordings"
-    lpips, without_lpips = None, []
+    without_lpips: list[str] = []
     try:
         lpips = lpips_of(config)
     except ValueError as error:
-        without_lpips = [f"LPIPS was left out: {error}."]
+        lpips = None
+        without_lpips.append(f"LPIPS was left out: {error}.")
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
     mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
