@@ -36,10 +36,8 @@ class Prediction(NamedTuple):
     """Natural logarithm of the expected squared error of DoLP."""
     stokes: Float[Tensor, "*b 2 h w"] | None = None
     """s1 = S1 / S0 and s2 = S2 / S0, from which `aolp` is computed."""
-    intensities: Float[Tensor, "*b c h w"] | None = None
-    """Intensities behind the polarizers at 0, 45, 90 and 135 degrees from which DoLP was computed.
-
-    c is 4, or 1 for a camera without polarizers, whose `dolp` is NaN."""
+    intensities: Float[Tensor, "*b 4 h w"] | None = None
+    """Intensities behind the polarizers at 0, 45, 90 and 135 degrees from which DoLP was computed."""
 
     @property
     def plain(self) -> Float[Tensor, "*b h w"] | None:

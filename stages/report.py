@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from polarnet.config.benchmark_tables import collect_rows, copy_histories
 from polarnet.config.experiments import changed_values
 from polarnet.config.pipeline import set_folder
-from polarnet.config.tables import collect_rows, copy_histories
 from polarnet.config.tree import Config, hydra_stage
 from polarnet.reports.artefacts import ReportPaths, Run, facts, git, read_results, results_table
 from polarnet.reports.page import write_report

@@ -22,9 +22,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from polarnet.config.benchmark_tables import collect_rows
 from polarnet.config.origins import Run, Stage, digest
 from polarnet.config.sweep import FAILURE, mark_finished, why_unfinished
-from polarnet.config.tables import collect_rows
 from polarnet.config.tree import Config, hydra_command, or_exit, typed
 from polarnet.runtime.files import claimed, code_digest
 from polarnet.runtime.machine import end_with_parent

@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS, ROWS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, joined, weights_record, why_absent
 from polarnet.metrics.references import REFERENCES
-from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.stokes import Prediction
 from polarnet.terminal.progress import steps
 
@@ -94,9 +92,3 @@ def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, 
     """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights."""
     methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].networks]
     return {method.section: weights_record(method, context.setups[method.section]) for method in methods}
-
-
-def metadata_used(names: Sequence[str], context: Context) -> dict[str, dict[str, Any]]:
-    """Checkpoint metadata by section of `methods`, for the rows with a checkpoint of polarnet."""
-    paths = {section: context.setups[section].weights for section in weights_used(names, context)}
-    return {row: load_checkpoint(path)[1] for row, path in paths.items() if path and path.suffix == ".safetensors"}

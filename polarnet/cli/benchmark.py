@@ -11,19 +11,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarnet.analysis.conditions import conditions, sentence, warnings
-from polarnet.analysis.recorded import make_recorded_set
 from polarnet.benchmark.results import write_benchmark
-from polarnet.benchmark.rows import available, metadata_used, weights_used
+from polarnet.benchmark.rows import available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.cli.options import CLEANING, cleaning_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root, working_folder
-from polarnet.config.pipeline import context_of, made_set
+from polarnet.cli.recorded import make_recorded_set
+from polarnet.config.pipeline import context_of, lpips_of, made_set
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
-from polarnet.metrics.lpips import Lpips, installed_version, record_of
+from polarnet.metrics.lpips import record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
@@ -66,7 +65,12 @@ def run(options: argparse.Namespace) -> None:
 def _score_folder(options: argparse.Namespace, config: Config, root: Path, cleaning: Cleaning) -> list[str]:
     """Run the benchmark on a folder, write scores and page, and return the notes on files and methods left out."""
     source = "--scenes" if options.scenes else "--recordings"
-    lpips, without_lpips = _lpips(config)
+    without_lpips: list[str] = []
+    try:
+        lpips = lpips_of(config)
+    except ValueError as error:
+        lpips = None
+        without_lpips.append(f"LPIPS was left out: {error}.")
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
     frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
     mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
@@ -79,11 +83,10 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     work = options.out / WORK / "set"
     with run_folder(options.out, f"benchmark {source}") as folder:
         if options.scenes:
-            used = conditions(config.synthesize, config.emulate)
-            about, differences = sentence(used), warnings(used, metadata_used(methods, context))
-            print("\n".join([about, *(f"WARNING: {line}" for line in differences)]), flush=True)
-            print("simulating the scenes; the first run also compiles the simulation", flush=True)
-            notes = [*differences, *_make_scenes(options, config, root, work)]
+            used = {name: dataclasses.asdict(getattr(config, name)) for name in ("synthesize", "emulate")}
+            about = _sequences_in_words(config)
+            print(about, "simulating the scenes; the first run also compiles the simulation", sep="\n", flush=True)
+            notes = _make_scenes(options, config, root, work)
         else:
             used, about = {}, RECORDED_SENTENCE
             notes = make_recorded_set(root, work, parse_mosaic(options.mosaic or PDAVIS), cleaning)
@@ -112,15 +115,11 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
     return notes
 
 
-def _lpips(config: Config) -> tuple[Lpips | None, list[str]]:
-    """Network of the column LPIPS, and a line that says why there is none; ValueError for damaged weights."""
-    if not config.benchmark.lpips:
-        return None, []
-    try:
-        installed_version(config.benchmark.lpips_backbone)
-    except ValueError as error:
-        return None, [f"LPIPS was left out: {error}."]
-    return Lpips.load(config.benchmark.lpips_backbone), []
+def _sequences_in_words(config: Config) -> str:
+    motion = config.synthesize
+    size = f"{motion.sensor_height}x{motion.sensor_width} pixels (height x width)"
+    pace = f"{motion.duration_s:g} s at {motion.frame_rate_hz:g} frames a second"
+    return f"Sequences of {size}, {pace}; sensor: model {config.emulate.model}."
 
 
 def _make_scenes(options: argparse.Namespace, config: Config, root: Path, work: Path) -> list[str]:

@@ -59,7 +59,8 @@ def command_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"polarnet {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_project, _stores, _simulate, _inspect, _recover, _convert, _fit_sensor, _onnx, _benchmark):
+    for add in (_project, _stores, _simulate, _inspect, _recover, _recover_rotating, _convert, _fit_sensor, _onnx,
+                _benchmark):  # fmt: skip
         add(functools.partial(_command, commands))
     return parser
 
@@ -249,27 +250,20 @@ def _recover(command: AddCommand) -> None:
         "recover 0.raw 45.raw 90.raw 135.raw --angles 0 45 90 135 --hot-pixels found",
         "recover outputs/simulate/lake/events.zarr --truth",
         "recover data/events.zarr --sequence lake-0 --step 1ms --write mp4",
-        "recover camera.raw --rotating 15",
         'recover dv://camera --live --mosaic "90 45 / 135 0"',
         description="""\
-Writes frames, pictures, a video and a page. INPUT is one of:
+Writes the frames as numbers, a video and a page. INPUT is one of:
 - four files, one for each polarizer, with --angles
 - one file of a camera with polarizers on its pixels, with --mosaic
-- one file of a camera behind a rotating polarizer, with --rotating or --triggers
-- an event store, or a folder that `polarnet convert` or `polarnet simulate --to hdf5` wrote
-- a folder of division-of-time captures
+- an event store
 - with --live, standard input (-) or a file with lines `t x y p angle`, or a camera with --mosaic: \
-dv://HOST:PORT of a program that streams its events, or dv://camera
-With a --method that reconstructs intensity, any other file of a camera gives plain intensity.""",
+dv://HOST:PORT of a program that streams its events, or dv://camera""",
     )
     add = recover.add_argument
-    add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, a folder, or -")
+    add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, or -")
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
-    add("--rotating", type=float, metavar="HZ", help="turns per second of a polarizer before the one camera")
-    add("--triggers", type=input_path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
-    add("--start-angle", type=float, metavar="DEG", help="its angle at time 0 or the first trigger (default: 0)")
-    add("--sequence", metavar="NAME", help="sequence of an event store or folder with several")
+    add("--sequence", metavar="NAME", help="sequence of an event store with several")
     add(
         "--truth", nargs="?", type=input_name, const=BESIDE, metavar="FRAMES",
         help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
@@ -277,10 +271,9 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent camera has ended (default: 5)")
-    add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="reduce the sensor to these rows and columns")
     _cleaning(recover)
     add("--window", help="length in time (default: 33.333ms, as in training)")
-    add("--step", help="time between frames (default: a window; with --rotating, half a turn)")
+    add("--step", help="time between frames (default: a window)")
     add(
         "--method",
         help="registered (the network over a whole recording, the default), ours (the network from window to window, "
@@ -295,10 +288,28 @@ With a --method that reconstructs intensity, any other file of a camera gives pl
     add("--device", default="auto", help="auto, cpu, cuda or cuda:N (default: auto)")
     add("--precision", choices=("auto", "fp32", "bf16"), default="auto", help="of the network (default: auto)")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
-    formats = ("zarr", "png", "mp4")
-    add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr png mp4)")
-    add("--video-rate", type=positive, default=30.0, metavar="HZ", help="frames a second of the video (default: 30)")
+    formats = ("zarr", "mp4")
+    add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr mp4)")
     _reading(recover)
+
+
+def _recover_rotating(command: AddCommand) -> None:
+    rotating = command(
+        "recover-rotating",
+        "recover_rotating.run",
+        "recover DoLP and AoLP from one camera behind a rotating polarizer",
+        "recover-rotating camera.raw --rate 15 --start-angle 30",
+        "recover-rotating camera.raw --triggers turns.txt",
+        description="Fits every half turn of the polarizer, pixel by pixel. Writes the files of `polarnet recover`.",
+    )
+    add = rotating.add_argument
+    add("input", type=input_path, metavar="INPUT", help="recording of the camera")
+    add("--rate", type=float, metavar="HZ", help="turns a second of the polarizer; negative: the other way")
+    add("--triggers", type=input_path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
+    add("--start-angle", type=float, default=0.0, metavar="DEG", help="at time 0 or the first trigger (default: 0)")
+    add("--step", help="time between frames: 10ms (default: half a turn)")
+    add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
+    _reading(rotating)
 
 
 def _convert(command: AddCommand) -> None:

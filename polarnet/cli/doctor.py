@@ -13,10 +13,7 @@ from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import bf16_units, memory, usable_cores
-from polarnet.terminal.installation import EXTRAS, installation, missing, requirements, version_of
-
-PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless",
-            "scikit-image", "dvc", "hydra-core")  # fmt: skip
+from polarnet.terminal.installation import EXTRAS, installation, missing, requirements, versions
 
 
 def doctor(options: argparse.Namespace) -> None:
@@ -30,12 +27,12 @@ def _findings() -> Iterator[tuple[str, str]]:
     gpus = ", ".join(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())) if cuda else ""
     units = ", ".join(bf16_units(torch.device("cuda" if cuda else "cpu")))
     yield "system", f"Python {platform.python_version()}, {platform.platform()}"
-    yield "packages", ", ".join(f"{name} {version_of(name) or 'missing'}" for name in PACKAGES)
+    yield "packages", versions()
     yield "device", gpus or f"CPU ({platform.processor() or platform.machine()}); no GPU that torch can use"
     yield "threads", f"{usable_cores()} cores, torch uses {torch.get_num_threads()}"
     yield "bf16", units or "emulated here and slower than fp32; train.precision=auto therefore uses fp32"
     for backbone in BACKBONES:
-        yield "LPIPS", _or_error(functools.partial(_lpips, backbone))
+        yield "LPIPS", f"{backbone}: {_or_error(functools.partial(installed_version, backbone))}"
     file = shipped_weights()
     digest = sha256(file)[:12]
     yield "weights", _or_error(lambda: f"{file} (network {load_checkpoint(file)[1]['network']}, sha256 {digest})")
@@ -50,10 +47,6 @@ def _or_error(finding: Callable[[], str]) -> str:
         return finding()
     except (ValueError, FileNotFoundError) as error:
         return str(error)
-
-
-def _lpips(backbone: str) -> str:
-    return f"{backbone}: {installed_version(backbone)}"
 
 
 def _extra(extra: str) -> str:

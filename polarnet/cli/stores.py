@@ -57,22 +57,17 @@ def view(options: argparse.Namespace) -> None:
     if page.is_file():
         refuse(options, "a folder with a page", ["sequence", "out", "part", *READING])
     else:
-        page = _written_page(options)
+        recording = is_recording(options.path)
+        unused = ["sequence"] if recording else ["part", *READING]
+        refuse(options, "a recording" if recording else "a store or a folder", unused)
+        open_file = functools.partial(open_recording, **reading_of(options))
+        films = films_of(options.path, options.sequence or (), open_file)
+        page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
+        page.parent.mkdir(parents=True, exist_ok=True)
+        write_player(page, f"{options.path}", films, {"command": options.command_line})
     print(f"page {page}")
     if not options.no_browser:
         webbrowser.open(page.resolve().as_uri())
-
-
-def _written_page(options: argparse.Namespace) -> Path:
-    if is_recording(options.path):
-        refuse(options, "a recording", ["sequence"])
-    else:
-        refuse(options, "a store or a folder", ["part", *READING])
-    open_file = functools.partial(open_recording, **reading_of(options))
-    films = films_of(options.path, options.sequence or (), open_file)
-    page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
-    page.parent.mkdir(parents=True, exist_ok=True)
-    return write_player(page, f"{options.path}", films, {"command": options.command_line})
 
 
 def video(options: argparse.Namespace) -> None:

@@ -147,7 +147,7 @@ def _check_params(settings: type, file: Path) -> None:
         root = yaml.compose(text)
         if (values := _values_of(root)) > MAX_VALUES:
             raise ValueError(f"expected at most {MAX_VALUES} values, {MAX_DEPTH} deep, its aliases make {values:g}")
-        content = yaml.load(text)
+        content = None if root is None else yaml.constructor.construct_document(root)
         if not isinstance(content, dict):
             raise ValueError("expected sections")
     except (ValueError, YAMLError, RecursionError) as error:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int8, Int16, Int64, Integer
+from jaxtyping import Bool, Int8, Int16, Int64, Integer
 from torch import Tensor
 
 from polarnet.runtime.arrays import Array, whole_numbers
@@ -136,19 +136,18 @@ def crop(events: Events, top: int, left: int, height: int, width: int) -> Events
     return replace(cut, x=cut.x - left, y=cut.y - top, height=height, width=width)
 
 
-def downscale(events: Events, height: int, width: int, *, sums: Float64[np.ndarray, "h w"] | None = None) -> Events:
+def downscale(events: Events, height: int, width: int) -> Events:
     """The events as a sensor of fewer pixels sees them: pixel (y, x) falls into (y * height // H, x * width // W).
 
     A coarse pixel keeps the threshold and the rate of a fine one: it fires each time the polarity sum of its fine
-    pixels moves by their mean number, H W / (height width). `sums` are these sums before the first event, 0 by default,
-    and are updated, so that a stream can come in pieces. ValueError for a larger size.
+    pixels moves by their mean number, H W / (height width). ValueError for a larger size.
     """
     if not (0 < height <= events.height and 0 < width <= events.width):
         raise ValueError(f"downscale: expected a size within {events.height}x{events.width} px, got {height}x{width}")
     y = (events.y.long() * height // events.height).short()
     x = (events.x.long() * width // events.width).short()
     fine_pixels = events.height * events.width / (height * width)
-    sums = np.zeros((height, width)) if sums is None else sums
+    sums = np.zeros((height, width))
     fired = torch.from_numpy(_fires(y.numpy(), x.numpy(), events.p.numpy(), sums, fine_pixels))
     return select(replace(events, x=x, y=y, height=height, width=width), fired)
 

@@ -24,13 +24,8 @@ TO_DEVIATION = 1.4826  # from median absolute value to standard deviation, for a
 RIDGE = 1e-9  # keeps the system solvable if all channels are equal
 
 
-def from_intensities(intensities: Float[Tensor, "n c h w"]) -> Prediction:
-    """DoLP and AoLP (Eq. 1-3) from the intensities of the four channels, which must share one scale.
-
-    A single channel, of a camera without polarizers, leaves DoLP unknown (NaN).
-    """
-    if intensities.shape[1] == 1:
-        return Prediction(torch.full_like(intensities[:, 0], torch.nan), intensities=intensities)
+def from_intensities(intensities: Float[Tensor, "n 4 h w"]) -> Prediction:
+    """DoLP and AoLP (Eq. 1-3) from the intensities of the four channels, which must share one scale."""
     stokes = stokes_from_intensities(intensities)
     return Prediction(dolp(stokes), aolp(stokes), intensities=intensities)
 

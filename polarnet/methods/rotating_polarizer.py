@@ -99,10 +99,9 @@ def local_variance(frame: Float[Tensor, "h w"], side: int) -> Float[Tensor, "h w
 
 
 def open_rotating(setup: Setup) -> Recoverer:
-    """Wrap the fit as a method; the events may be in any channel, the others are empty. ValueError if no rotation."""
+    """Wrap the fit as a method; the events may be in any channel, the others are empty."""
     config, rotation = setup.config, setup.rotation
-    if rotation is None:
-        raise ValueError("expected the rotation of the polarizer too: --rotating HZ or --triggers FILE")
+    assert rotation is not None, "the method needs the rotation of the polarizer"
 
     def predict(recent: Events, windows: Sequence[EventWindow]) -> tuple[Events, Prediction]:
         maps = []

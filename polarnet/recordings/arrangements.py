@@ -78,10 +78,8 @@ def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int |
             yield Piece([shifted(events, origin_us) for events in channels], until_us, read_at)
 
 
-def open_four(
-    files: Mapping[int, str | os.PathLike[str]], open_file: Open = open_recording, origin_us: int | None = None
-) -> Channels:
-    """The channels of `read_four`, in pieces; time 0 is `origin_us` (None: the earliest of all events)."""
+def open_four(files: Mapping[int, str | os.PathLike[str]], open_file: Open = open_recording) -> Channels:
+    """The channels of `read_four`, in pieces."""
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
         raise RecordingError(f"expected one file for each of 0, 45, 90 and 135 degrees, got {sorted(files)}")
@@ -90,7 +88,7 @@ def open_four(
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
     nothing = Events.empty(*sizes.pop())
-    return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers, origin_us)
+    return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers)
 
 
 def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[list[Events]]:

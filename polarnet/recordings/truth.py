@@ -60,6 +60,15 @@ def read_truth(path: Path, mosaic: Mosaic) -> Truth:
     return _demosaicked(frames, mosaic)
 
 
+def check_size(path: Path, truth: Truth, height: int, width: int) -> None:
+    """RecordingError unless the frames are those of a sensor of this size, without a last odd row or column."""
+    expected, size = (height // 2 * 2, width // 2 * 2), truth.light.shape[1:]
+    if size != expected:
+        raise RecordingError(
+            f"{path.name}: expected frames of the sensor's {height}x{width} px, got {size[0]}x{size[1]}"
+        )
+
+
 def _from_maps(frames: CameraFrames, mosaic: Mosaic) -> Truth:
     """The file's own maps; its raw frames, if there, tell which cells are saturated."""
     assert frames.maps is not None

@@ -1,30 +1,25 @@
-"""Inputs of `polarnet recover`: files in any arrangement of polarizers, stores, folders of captures, live input."""
+"""Inputs of `polarnet recover`: files in any arrangement of polarizers, stores, live input."""
 
 import itertools
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
-from polarnet.captures.dot import EVENT_CAPTURES, RecordingsConfig
-from polarnet.captures.targets import calibrate_targets
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
-from polarnet.events.stream import Events, downscale
-from polarnet.events.streaming import WindowRule
-from polarnet.recordings.arrangements import Channels, Open, Piece, open_four, open_mosaic, open_plain
+from polarnet.events.stream import Events
+from polarnet.recordings.arrangements import Channels, Open, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.truth import read_truth
+from polarnet.recordings.truth import check_size, read_truth
 from polarnet.recovery.stream import Input
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, stokes_from_polarization
+from polarnet.stokes import Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import METADATA, unknown_sequence
 
@@ -32,40 +27,59 @@ STANDARD_INPUT = "-"
 STEPS_PER_BLOCK = 64  # steps of the store's index, 2**14 events each
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files to recover, and the arrangement of their polarizers, as the user gives them."""
+def open_channels(
+    paths: Sequence[Path],
+    angles: Sequence[int] | None = None,
+    mosaic: Mosaic | None = None,
+    sequence: str | None = None,
+    open_file: Open = open_recording,
+) -> Channels:
+    """The four channels in files, starting at time 0; a ValueError says what is missing.
 
-    paths: Sequence[Path]
-    angles: Sequence[int] | None = None
-    """Polarizer angle of each of four files, in degrees and in the order of the files."""
-    mosaic: Mosaic | None = None
-    sequence: str | None = None
-    """Sequence to read from an event store or a folder that holds several."""
-    plain: bool = False
-    """Whether any other file is one channel, of a camera without polarizers."""
-    open: Open = open_recording
-    captures: RecordingsConfig | None = None
-    """Settings of division-of-time captures; needed for a folder of them."""
-
-
-def open_files(files: Files, work: Path, size: Sequence[int] | None = None, clean: Cleaner | None = None) -> Input:
-    """Open channels in files, starting at time 0 and reduced to `size` (height, width) if given.
-
-    Four files hold one channel each. A single path is a recording of a camera with a mosaic, an event store, a folder
-    that `polarnet convert` wrote, or a folder of division-of-time captures, which are calibrated in `work`, a folder
-    without other targets. `clean` removes noise before the size is reduced. A ValueError or FileNotFoundError says what
-    is missing.
+    Four files hold one channel each, behind polarizers at `angles`, in degrees and in the order of the files. A single
+    path is a recording of a camera with a `mosaic`, or an event store, of which `sequence` is read.
     """
-    missing = [str(path) for path in files.paths if not path.exists()]
-    if missing:
-        raise FileNotFoundError(f"{', '.join(missing)}: there is no such file")
-    return _input(", ".join(path.name for path in files.paths), _channels(files, work), size, clean)
+    if len(paths) == 4:
+        if angles is None:
+            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
+        return open_four(dict(zip(angles, paths, strict=True)), open_file)
+    if len(paths) != 1 or angles is not None:
+        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(paths)}")
+    (path,) = paths
+    if mosaic is not None:
+        return open_mosaic(path, mosaic, open_file)
+    if not (path / METADATA).is_file():
+        raise ValueError(
+            f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
+            f"'90 45 / 135 0', or give four files with --angles, or an event store"
+        )
+    store = EventStore.open(path)
+    name = store.sequences[0] if sequence is None and len(store.sequences) == 1 else sequence
+    if name not in store.sequences:
+        raise ValueError(f"{path.name}: --sequence: {unknown_sequence(name, store.sequences)}")
+    return _stored(store, name)
 
 
-def open_rotating(
-    path: Path, rotation: Rotation, open_file: Open, size: Sequence[int] | None
-) -> tuple[Input, Rotation]:
+def _stored(store: EventStore, sequence: str) -> Channels:
+    """A sequence of a store, in blocks of about a million events."""
+
+    def blocks() -> Iterator[Sequence[Events]]:
+        times = sorted(itertools.chain(*store.record(sequence)["index"]))
+        edges = [0, *sorted(set(times[STEPS_PER_BLOCK::STEPS_PER_BLOCK]) - {0}), None]
+        for start_us, stop_us in itertools.pairwise(edges):
+            yield store.read(sequence, start_us, stop_us)
+
+    return Channels(store.height, store.width, blocks, origin_us=0)
+
+
+def input_of(name: str, channels: Channels, clean: Cleaner | None = None) -> Input:
+    """Channels as the input of a recovery, from which `clean` removes noise."""
+    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
+    pieces = channels if clean is None else clean.clean(channels)
+    return Input(name, channels.height, channels.width, pieces, repairs, channels.number)
+
+
+def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:
     """Open the events of one camera behind a rotating polarizer, whose times count from the first event.
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
@@ -74,20 +88,16 @@ def open_rotating(
     first = next(channels.blocks(), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
-    return _input(path.name, channels, size), rotation.since(int(first[0].t[0]))
+    return input_of(path.name, channels), rotation.since(int(first[0].t[0]))
 
 
 def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
-    """The frames of a recording, whose times count from its first event as those of `open_files` do.
+    """The frames of a recording, whose times count from its first event as those of `open_channels` do.
 
     RecordingError for a file without events, of another format than those with frames, or without frames.
     """
     truth, reader = read_truth(path, mosaic), open_file(path)
-    if truth.dolp.shape[1:] != (reader.height // 2, reader.width // 2):
-        height, width = truth.light.shape[1:]
-        raise RecordingError(
-            f"{path.name}: expected frames of the sensor's {reader.height}x{reader.width} px, got {height}x{width}"
-        )
+    check_size(path, truth, reader.height, reader.width)
     first = next(iter(reader), None)
     if first is None:
         raise RecordingError(f"{path.name}: expected events, the file has none")
@@ -127,98 +137,8 @@ def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: f
         turn = 1.0 if rate_hz is None else math.copysign(1.0, rate_hz)
         return triggered_rotation(_trigger_times_us(triggers), start_angle, turn)
     if rate_hz is None:
-        raise ValueError("expected the rate of the polarizer (--rotating HZ) or its triggers (--triggers FILE)")
+        raise ValueError("expected the rate of the polarizer (--rate HZ) or its triggers (--triggers FILE)")
     return steady_rotation(rate_hz, start_angle)
-
-
-def half_turn_rule(rotation: Rotation, step_us: int | None = None) -> WindowRule:
-    """Consecutive windows of `step_us` (default: half a turn)."""
-    return WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
-
-
-def _input(name: str, channels: Channels, size: Sequence[int] | None, clean: Cleaner | None = None) -> Input:
-    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
-    pieces = channels if clean is None else clean.clean(channels)
-    height, width = size or (channels.height, channels.width)
-    pieces = pieces if size is None else _reduced(pieces, np.zeros((channels.number, height, width)))
-    return Input(name, height, width, pieces, repairs, channels.number)
-
-
-def _reduced(pieces: Iterable[Piece], sums: Float64[np.ndarray, "c h w"]) -> Iterator[Piece]:
-    """Pieces with the fewer pixels of `sums`, see `downscale`."""
-    for piece in pieces:
-        both = zip(piece.channels, sums, strict=True)
-        yield piece._replace(channels=[downscale(e, *own.shape, sums=own) for e, own in both])
-
-
-def _channels(files: Files, work: Path) -> Channels:
-    if len(files.paths) == 4:
-        if files.angles is None:
-            raise ValueError("four files: say the polarizer of each, in their order, such as --angles 0 45 90 135")
-        return open_four(dict(zip(files.angles, files.paths, strict=True)), open_file=files.open)
-    if len(files.paths) != 1 or files.angles is not None:
-        raise ValueError(f"expected one file or folder, or four files with --angles, got {len(files.paths)}")
-    (path,) = files.paths
-    if files.mosaic is not None:
-        return open_mosaic(path, files.mosaic, files.open)
-    if path.is_dir() and any(path.glob(f"{EVENT_CAPTURES[0]}.*")):
-        return _captured(path, work, files.captures)
-    if path.is_dir() and (exported := _exported(path, files.sequence)):
-        return open_four(exported, files.open, origin_us=0)  # times count from the sequence's start
-    if (path / METADATA).is_file():
-        store = EventStore.open(path)
-        return _stored(store, _named(files.sequence, store.sequences, path.name))
-    if files.plain:
-        return open_plain(path, files.open)
-    raise ValueError(
-        f"{path.name} is one file of events: say where the polarizers of its pixels are, such as --mosaic "
-        f"'90 45 / 135 0', or give four files with --angles, an event store, or a folder of {EVENT_CAPTURES[0]}.*, "
-        f"...; for its intensity alone, give a --method that reconstructs it, such as e2v or highpass"
-    )
-
-
-def _stored(store: EventStore, sequence: str) -> Channels:
-    """A sequence of a store, in blocks of about a million events."""
-
-    def blocks() -> Iterator[Sequence[Events]]:
-        times = sorted(itertools.chain(*store.record(sequence)["index"]))
-        edges = [0, *sorted(set(times[STEPS_PER_BLOCK::STEPS_PER_BLOCK]) - {0}), None]
-        for start_us, stop_us in itertools.pairwise(edges):
-            yield store.read(sequence, start_us, stop_us)
-
-    return Channels(store.height, store.width, blocks, origin_us=0)
-
-
-def _exported(folder: Path, sequence: str | None) -> dict[int, Path]:
-    """Files by angle in a folder that `polarnet convert` or `polarnet simulate` wrote; empty for any other folder."""
-    if names := sorted({path.parent.name for path in folder.glob(f"*/polarizer_{POLARIZER_ANGLES_DEG[0]:03d}.*")}):
-        folder = folder / _named(sequence, names, folder.name)
-    files = {angle: sorted(folder.glob(f"polarizer_{angle:03d}.*")) for angle in POLARIZER_ANGLES_DEG}
-    if not all(files.values()):
-        return {}
-    if several := next((paths for paths in files.values() if len(paths) > 1), None):
-        raise ValueError(
-            f"{folder}: expected one file for each polarizer, got {', '.join(path.name for path in several)}; "
-            f"name the four files, with --angles 0 45 90 135"
-        )
-    return {angle: path for angle, (path,) in files.items()}
-
-
-def _named(sequence: str | None, names: list[str], where: str) -> str:
-    """The sequence of that name, or the only one; ValueError if there is none."""
-    if sequence is None and len(names) == 1:
-        return names[0]
-    if sequence is None or sequence not in names:
-        raise ValueError(f"{where}: --sequence: {unknown_sequence(sequence, names)}")
-    return sequence
-
-
-def _captured(folder: Path, work: Path, config: RecordingsConfig | None) -> Channels:
-    if config is None:
-        raise ValueError(f"{folder.name}: expected the settings of division-of-time captures, section recordings")
-    target = folder.resolve()
-    calibrate_targets([target], work / "calibrated", config, {})
-    return _stored(EventStore.open(work / "calibrated" / "events.zarr"), target.name)
 
 
 def _trigger_times_us(path: Path) -> np.ndarray:

@@ -7,14 +7,13 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from polarnet.events.rotation import Rotation
 from polarnet.events.streaming import (
     SHORTEST_STEP_US,
     TRAINED_WINDOW_US,
@@ -31,8 +30,8 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.ahead import Ahead
 from polarnet.recovery.writer import RecoveryWriter
-from polarnet.runtime.machine import precision_on, tune
-from polarnet.stokes import Prediction, StokesFrames
+from polarnet.runtime.machine import tune
+from polarnet.stokes import Prediction
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 
@@ -63,7 +62,7 @@ class Input(NamedTuple):
     repairs: Mapping[str, Mapping[str, int]] = {}
     """Unusable events by file and kind (`polarnet.recordings.source.REPAIRS`), counted while `pieces` are read."""
     channels: int = 4
-    """4, or 1 for a camera behind a rotating polarizer or none."""
+    """4, or 1 for a camera behind a rotating polarizer."""
     live: bool = False
     """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
     waits: bool = True
@@ -86,64 +85,35 @@ class Frame(NamedTuple):
     """Time from the arrival of the window's last event to the frame in memory."""
 
 
-@dataclass(frozen=True)
-class ChosenMethod:
-    """Method and its settings, as the user gives them."""
+def open_method(
+    method: Method, setup: Setup, weights: Path | None = None, settings: Mapping[str, Any] = {}
+) -> tuple[Recoverer, str]:
+    """Open a method with the user's weights (None: the shipped ones, else those of the setup) and describe it in words.
 
-    name: str
-    weights: Path | None = None
-    """None: the shipped weights, else those of the method's section."""
-    precision: str = "auto"
-    """Number format of a network: fp32, bf16, or auto, which selects bf16 if the device has units for it."""
-    thresholds: Sequence[float] | None = None
-    """Contrast thresholds of the camera, ON and OFF; None: those of the method's section."""
-    binning: int | None = None
-    """Side in pixels of the blocks that the network sees; None: that of the method's section."""
-    rotation: Rotation | None = None
-    """Angle of the rotating polarizer before the camera, by the clock of the events."""
-    frames: StokesFrames | None = None
-    """Frames of the camera, by the clock of the events."""
-
-
-def open_method(chosen: ChosenMethod, setup_of: Callable[[Method], Setup]) -> tuple[Recoverer, str]:
-    """Open a method with the inputs of `setup_of` and the user's changes, and describe it in words.
-
-    A ValueError or FileNotFoundError says what is missing.
+    `settings` are values of its section by key; None leaves a value as it is. A ValueError or FileNotFoundError says
+    what is missing.
     """
     tune()
-    method = METHODS[chosen.name]
-    setup = setup_of(method)
-    setup = replace(
-        setup,
-        precision=precision_on(setup.device, chosen.precision),
-        rotation=chosen.rotation,
-        frames=chosen.frames,
-    )
-    if chosen.frames is not None and not method.takes_frames:
-        raise ValueError(f"--frames is for --method {', '.join(_framed())}, {method.name} does not use them")
-    for option, value in (("thresholds", chosen.thresholds), ("binning", chosen.binning)):
-        if value is not None and not hasattr(setup.config, option):
+    if setup.frames is not None and not method.takes_frames:
+        framed = ", ".join(name for name, one in METHODS.items() if one.takes_frames)
+        raise ValueError(f"--frames is for --method {framed}, {method.name} does not use them")
+    for option, value in ((option, value) for option, value in settings.items() if value is not None):
+        if not hasattr(setup.config, option):
             raise ValueError(f"--{option} is for the DoLP network, {method.name} does not use it")
-        if value is not None:
-            setup = replace(setup, config=replace(setup.config, **{option: value}))
+        setup = replace(setup, config=replace(setup.config, **{option: value}))
     if not method.networks:
-        if chosen.weights is not None:
+        if weights is not None:
             raise ValueError(f"--weights: {method.name} has no weights; leave it out")
-        turns = f", {setup.rotation.rate_hz:g} turns/s" if setup.rotation else ""
-        return method.open(setup), f"{method.name}{turns}"
-    weights = chosen.weights or (shipped_weights() if method.shipped else setup.weights)
+        return method.open(setup), method.name
+    weights = weights or (shipped_weights() if method.shipped else setup.weights)
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")
     recoverer = method.open(setup)
     whole = ", over the whole recording (--method ours: only the past)" if recoverer.sees_ahead else ""
-    if chosen.frames is not None:
-        whole += f", with {len(chosen.frames.t_us)} frames of the camera"
+    if setup.frames is not None:
+        whole += f", with {len(setup.frames.t_us)} frames of the camera"
     return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
-
-
-def _framed() -> list[str]:
-    return [name for name, method in METHODS.items() if method.takes_frames]
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
@@ -234,8 +204,8 @@ def _live_runs(
 
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:
-    """ValueError for a DoLP with NaN or infinity, but for a camera without polarizers, which has none."""
-    if frame.plain is None and not frame.dolp.isfinite().all():
+    """ValueError for a DoLP with NaN or infinity."""
+    if not frame.dolp.isfinite().all():
         raise ValueError(
             f"the DoLP of the window from {window.start_us} to {window.stop_us} us is not finite: the weights or the "
             "thresholds are no working ones; the frames before it are whole"

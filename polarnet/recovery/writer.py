@@ -1,19 +1,16 @@
-"""Write the results of `polarnet recover`: numbers (Zarr), pictures (PNG), a video, and a page.
+"""Write the results of `polarnet recover`: numbers (Zarr), a video, and a page.
 
-A picture shows DoLP, AoLP and the events of the window side by side; of a camera without polarizers, the intensity and
-the events. The video's pictures are labelled and also show polarization with the reconstructed S0. Everything is
-written as frames arrive, in constant memory.
+The video shows the events of each window, DoLP, AoLP, and polarization with the reconstructed S0. Everything is written
+as frames arrive, in constant memory.
 """
 
 import shutil
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8, UInt16
@@ -22,36 +19,26 @@ from torch import Tensor
 from polarnet.events.representations import polarity_sums
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.method import Recoverer, State
-from polarnet.reports.maps import (
-    EventScale,
-    angle_image,
-    dolp_image,
-    encode_png,
-    event_image,
-    intensity_image,
-    polarization_hsv,
-)
-from polarnet.reports.player import MAX_FRAMES, TRUTH, Film, Kind, Map, write_player
-from polarnet.reports.preview import Captioned, Sheet, VideoWriter, foot_of, with_even_sides
+from polarnet.reports.maps import angle_image, dolp_image, encode_png, polarization_hsv
+from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map, write_player
+from polarnet.reports.preview import PICTURES_PER_SECOND, Sheet, VideoWriter, foot_of
 from polarnet.runtime.machine import usable_cores
 from polarnet.stokes import Prediction
 from polarnet.storage.frames import ANGLE_STEPS, FRACTION_STEPS, FRAMES_PER_CHUNK, Polarization
 from polarnet.storage.groups import GrowingColumns
-from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.true_frames import TrueFrames
 
+OUTPUTS = ("zarr", "mp4")
 VIDEO = "recovered.mp4"
 MIN_FREE_BYTES = 2**26  # disk space kept free for the last frames, the video's index and the page
 MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
-GAP = 4  # pixels between the maps of a picture
-DOLP, INTENSITY, ANGLE, EVENTS = "DoLP", "intensity", "AoLP (hue), DoLP (saturation)", "events"  # captions
+ANGLE = "AoLP (hue), DoLP (saturation)"  # caption
 RECOVERED = "recovered"  # source of the maps on the page
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, end of its window, microseconds from the first event",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
-    "intensity": "intensity from 0 to 1, divided by 65535, of a camera without polarizers; it has no dolp",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
 }
 
@@ -64,25 +51,11 @@ class Picture(NamedTuple):
     """The maps as bytes (`polarnet.storage.panels`) by source and kind, for the page."""
 
 
-@dataclass
-class _Sample:
-    """A sample of the pictures, evenly spread over a stream of unknown length."""
-
-    pictures: list[Picture]
-    every: int = 1
-
-    def offer(self, picture: Picture) -> None:
-        self.pictures.append(picture)
-        if len(self.pictures) > 2 * MAX_FRAMES:
-            self.pictures, self.every = self.pictures[::2], 2 * self.every
-
-
 class RecoveryWriter:
     """Writes frames into a folder as they arrive; as a context manager it waits for the last and closes the files.
 
-    `outputs` is a subset of zarr, png and mp4. The folder gets recovered.zarr, png/*.png and recovered.mp4
-    (`video_rate_hz` frames a second, whatever the time between them). `write_page` adds index.html and recovered.png,
-    the video's picture of the last frame.
+    `outputs` is a subset of `OUTPUTS`. The folder gets recovered.zarr and recovered.mp4 (30 frames a second, whatever
+    the time between them). `write_page` adds index.html and recovered.png, the video's picture of the last frame.
     `reconstruct` is a method that reconstructs intensity, for the S0 of the video; without it the video shows
     polarization at full value. `truth` is shown in the video and on the page beside each frame.
     """
@@ -91,7 +64,6 @@ class RecoveryWriter:
         self,
         folder: Path,
         outputs: Collection[str],
-        video_rate_hz: float,
         reconstruct: Recoverer | None = None,
         truth: TrueFrames | None = None,
     ):
@@ -99,19 +71,16 @@ class RecoveryWriter:
         self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
         self.frames = self.stop_us = 0
-        self._plain = False
-        self._sample = _Sample([])
-        self._scale = EventScale()
+        self._pictures: list[Picture] = []  # evenly spread over a stream of unknown length
+        self._every = 1
         self._sheet: Sheet | None = None
-        self._latest: tuple[EventWindow, Prediction, Captioned] | None = None
+        self._latest: tuple[EventWindow, Prediction, Float[Tensor, "h w"]] | None = None
         self._arrays = GrowingColumns(folder / "recovered.zarr", FRAMES_PER_CHUNK, False, ZARR_CONVENTIONS)
-        self._video = VideoWriter(folder / VIDEO, video_rate_hz)
+        self._video = VideoWriter(folder / VIDEO, PICTURES_PER_SECOND)
         # A second thread that computes on several cores would put those of the network to sleep between operations.
         self._thread = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,))
         self._waiting: deque[Future] = deque()
         folder.mkdir(parents=True, exist_ok=True)
-        if "png" in outputs:
-            (folder / "png").mkdir(exist_ok=True)
 
     def __enter__(self) -> "RecoveryWriter":
         return self
@@ -126,7 +95,6 @@ class RecoveryWriter:
 
     def add(self, window: EventWindow, prediction: Prediction, live: bool = False) -> None:
         """Add a frame on the CPU; returns before it is written, unless the queue is long, or `live` and cores few."""
-        self._plain = prediction.plain is not None
         self._waiting.append(self._thread.submit(self._write, self.frames, window, prediction))
         self._wait(0 if live and usable_cores() <= FEW_CORES else MAX_QUEUED)
         self.frames += 1
@@ -134,12 +102,10 @@ class RecoveryWriter:
 
     def write_page(self, source: str, facts: Mapping[str, str], notes: Sequence[str]) -> Path:
         """Write index.html about the recovery from `source`, and recovered.png; call it after the `with` block."""
-        pictures = self._sample.pictures
-        if self._latest is not None:
-            (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
-        video = VIDEO if "mp4" in self.outputs and self.frames else None
-        films = [_film(source, pictures)] if pictures else []
-        title = f"{'Intensity' if self._plain else 'DoLP'} from events: {source}"
+        assert self._latest is not None, "a recovery has at least one frame"
+        (self.folder / "recovered.png").write_bytes(encode_png(self._labelled(*self._latest)))
+        films, title = [_film(source, self._pictures)], f"DoLP from events: {source}"
+        video = VIDEO if "mp4" in self.outputs else None
         return write_player(self.folder / "index.html", title, films, facts, notes, video)
 
     def _wait(self, most: int) -> None:
@@ -151,31 +117,32 @@ class RecoveryWriter:
             raise OSError(f"{self.folder}: the disk is full; all {number} frames up to here are whole")
         if "zarr" in self.outputs:
             self._add_to_zarr(window, prediction)
-        sampled = number % self._sample.every == 0
-        if not (sampled or {"mp4", "png"} & set(self.outputs)):
+        sampled = number % self._every == 0
+        if not (sampled or "mp4" in self.outputs):
             return
         events = torch.stack([polarity_sums(channel) for channel in window.channels]).sum(0)
-        maps = _coloured(prediction, event_image(events, self._scale.after(events)))
-        self._latest = window, prediction, maps
+        self._latest = window, prediction, events
         if "mp4" in self.outputs:
-            self._video.add(self._labelled(window, prediction, maps))
+            self._video.add(self._labelled(window, prediction, events))
         if sampled:
             true = None if self._truth is None else self._truth.at(window.stop_us)
-            self._sample.offer(Picture(window.stop_us, _byte_maps(events, prediction, true)))
-        if "png" in self.outputs:
-            _write_png(self.folder / "png" / f"{number:06d}.png", _side_by_side(maps))
+            self._pictures.append(Picture(window.stop_us, _byte_maps(events, prediction, true)))
+            if len(self._pictures) > 2 * MAX_FRAMES:
+                self._pictures, self._every = self._pictures[::2], 2 * self._every
 
-    def _labelled(self, window: EventWindow, prediction: Prediction, maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def _labelled(
+        self, window: EventWindow, prediction: Prediction, events: Float[Tensor, "h w"]
+    ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The picture of the video: events and DoLP above polarization and AoLP, with their truth where it is known."""
         if self._sheet is None:
             self._sheet = Sheet(*prediction.dolp.shape)
-        above, below = {name: maps[name] for name in (EVENTS, DOLP, INTENSITY) if name in maps}, {}
+        above, below = {"events": self._sheet.events(events[None])[0], "DoLP": dolp_image(prediction.dolp)}, {}
         true = None if self._truth is None else self._truth.at(window.stop_us)
         if prediction.aolp is not None:
             s0, kind = (true.s0, "true") if true else (self._s0(window, prediction), "reconstructed")
             if s0 is not None:
                 below[f"polarization, {kind} S0"] = polarization_hsv(s0, prediction.dolp, prediction.aolp)
-            below[ANGLE] = maps[ANGLE]
+            below[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
         if true:
             above["true DoLP"] = dolp_image(true.dolp)
             below[f"true {ANGLE}"] = angle_image(true.dolp, true.aolp)
@@ -193,28 +160,13 @@ class RecoveryWriter:
         return None if intensities is None else intensities.mean(0).float()
 
     def _add_to_zarr(self, window: EventWindow, prediction: Prediction) -> None:
-        plain = prediction.plain
-        name, values = ("dolp", prediction.dolp) if plain is None else ("intensity", plain)
-        frame = {"t_us": np.array(window.stop_us, np.int64), name: _quantised(values * FRACTION_STEPS)}
+        dolp = _quantised(prediction.dolp * FRACTION_STEPS)
+        frame = {"t_us": np.array(window.stop_us, np.int64), "dolp": dolp}
         if prediction.aolp is not None:
             frame["aolp"] = _quantised(prediction.aolp * (ANGLE_STEPS / np.pi) % ANGLE_STEPS)
         if prediction.log_variance is not None:
             frame["log_variance"] = prediction.log_variance.numpy().astype(np.float32)
         self._arrays.add(frame)
-
-
-def _coloured(prediction: Prediction, events: UInt8[np.ndarray, "h w 3"]) -> Captioned:
-    """The maps of a frame as pictures, by caption."""
-    plain = prediction.plain
-    maps = {DOLP: dolp_image(prediction.dolp)} if plain is None else {INTENSITY: intensity_image(plain)}
-    if prediction.aolp is not None:
-        maps[ANGLE] = angle_image(prediction.dolp, prediction.aolp)
-    return maps | {EVENTS: events}
-
-
-def _side_by_side(maps: Captioned) -> UInt8[np.ndarray, "h2 w2 3"]:
-    gap = np.full((maps[EVENTS].shape[0], GAP, 3), 255, np.uint8)
-    return with_even_sides(np.concatenate([part for one in maps.values() for part in (one, gap)][:-1], axis=1))
 
 
 def _quantised(steps: Tensor) -> UInt16[np.ndarray, "h w"]:
@@ -225,20 +177,15 @@ def _byte_maps(
     events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
 ) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
     """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
-    plain = prediction.plain
-    maps: dict[tuple[str, Kind], Tensor] = {("Events", "events"): signed_bytes(events)}
+    values: dict[tuple[str, Kind], Tensor] = {("Events", "events"): events}
     if true is not None:
-        maps |= {
-            (TRUTH, "s0"): fraction_bytes(true.s0),
-            (TRUTH, "aolp"): angle_bytes(true.aolp),
-            (TRUTH, "dolp"): fraction_bytes(true.dolp),
-        }
-    if plain is not None:
-        return maps | {(RECOVERED, "s0"): fraction_bytes(plain)}
-    if prediction.intensities is not None and true is None:
-        maps[RECOVERED, "s0"] = fraction_bytes(prediction.intensities[::2].float().mean(0))
-    maps[RECOVERED, "dolp"] = fraction_bytes(prediction.dolp)
-    return maps if prediction.aolp is None else maps | {(RECOVERED, "aolp"): angle_bytes(prediction.aolp)}
+        values |= {(TRUTH, "s0"): true.s0, (TRUTH, "aolp"): true.aolp, (TRUTH, "dolp"): true.dolp}
+    elif prediction.intensities is not None:
+        values[RECOVERED, "s0"] = prediction.intensities[::2].float().mean(0)
+    values[RECOVERED, "dolp"] = prediction.dolp
+    if prediction.aolp is not None:
+        values[RECOVERED, "aolp"] = prediction.aolp
+    return {name: TO_BYTES[name[1]](one) for name, one in values.items()}
 
 
 def _film(source: str, pictures: Sequence[Picture]) -> Film:
@@ -246,10 +193,3 @@ def _film(source: str, pictures: Sequence[Picture]) -> Film:
     names = [name for name in pictures[0].maps if all(name in one.maps for one in pictures)]
     maps = [Map(*name, torch.stack([one.maps[name] for one in pictures]).numpy()) for name in names]
     return Film(source, [one.t_us for one in pictures], maps)
-
-
-def _write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Write a PNG without compression or filters, which cost more: thousands are written while a camera runs."""
-    how = [cv2.IMWRITE_PNG_COMPRESSION, 0, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
-    _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), how)
-    path.write_bytes(data.data)

@@ -6,7 +6,6 @@ from polarnet.terminal.lazy import attach
 
 if TYPE_CHECKING:
     from polarnet.reports.preview import VideoWriter as VideoWriter
-    from polarnet.reports.preview import plot_prediction as plot_prediction
     from polarnet.reports.preview import write_true_video as write_true_video
 
 __getattr__, __dir__, __all__ = attach(__name__, __file__)

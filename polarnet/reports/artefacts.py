@@ -1,6 +1,5 @@
 """The pipeline's outputs as the report reads them, and the code, machine and versions behind them."""
 
-import importlib.metadata
 import json
 import platform
 import subprocess
@@ -13,6 +12,7 @@ from polarnet.reports.legend import legend_of
 from polarnet.reports.tables import Table, score_table
 from polarnet.runtime.machine import usable_cores
 from polarnet.storage.panels import Panel, read_panel
+from polarnet.terminal.installation import versions
 
 SIMULATED = "simulated"  # name of the pipeline's own test set
 
@@ -62,9 +62,6 @@ def _json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "opencv-contrib-python-headless", "dvc", "hydra-core")
-
-
 @dataclass(frozen=True)
 class Run:
     """Provenance of a run's results, as shown on the page."""
@@ -82,11 +79,10 @@ def facts(root: Path) -> dict[str, str]:
     commit = git(root, "rev-parse", "HEAD") or "none: not a git repository with a commit"
     # the pipeline's own outputs do not count as changes of the code
     changed = git(root, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!dvc.lock", ":!data")
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     return {
         "commit": f"{commit}, with uncommitted changes" if changed else commit,
         "machine": f"{processor()}, {usable_cores()} cores, {platform.system()} {platform.machine()}",
-        "versions": f"Python {platform.python_version()}, {versions}",
+        "versions": f"Python {platform.python_version()}, {versions()}",
     }
 
 

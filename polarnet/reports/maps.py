@@ -23,7 +23,6 @@ EVENT_COLOURS = LinearSegmentedColormap.from_list(
 )
 DOTS_PER_INCH = 160  # of figures
 FULL_SCALE_QUANTILE = 0.99  # of the pixels with events, so that a few hot pixels do not bleach a picture
-SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 
 
 def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
@@ -34,19 +33,6 @@ def event_full_scale(events: Float[Tensor, "*b h w"]) -> float:
     magnitude = events.abs()
     active = magnitude[magnitude > 0].numpy(force=True)
     return float(np.quantile(active, FULL_SCALE_QUANTILE)) if len(active) else 1.0
-
-
-class EventScale:
-    """Full scale of the event pictures of one sequence; it follows the number of events slowly."""
-
-    def __init__(self):
-        self._scale: float | None = None
-
-    def after(self, events: Float[Tensor, "*b h w"]) -> float:
-        """Return the full scale of the next picture, which shows `events`."""
-        present = event_full_scale(events)
-        self._scale = present if self._scale is None else SCALE_INERTIA * self._scale + (1 - SCALE_INERTIA) * present
-        return self._scale
 
 
 def event_image(events: Float[Tensor, "h w"], full_scale: float) -> UInt8[np.ndarray, "h w 3"]:
@@ -123,3 +109,5 @@ def _coloured(unit: np.ndarray, table: UInt8[np.ndarray, "n 3"]) -> UInt8[np.nda
 
 
 DOLP_TABLE, EVENT_TABLE = table_of(matplotlib.colormaps[DOLP_COLOURS]), table_of(EVENT_COLOURS)
+AOLP_TABLE = angle_image(torch.ones(1, 256), torch.arange(256)[None] * (math.pi / 256))[0]
+"""The hues of `angle_image` at DoLP 1; a smaller DoLP blends them with white."""

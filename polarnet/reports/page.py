@@ -19,7 +19,7 @@ from polarnet.reports.figures import svg
 from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
 from polarnet.reports.maps import write_figure
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
-from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, paper_table, score_table
+from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, score_table
 from polarnet.runtime.files import check_name
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import best_row, read_history
@@ -107,7 +107,6 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
         "glossary": glossary(metrics, legend),
-        "published": {experiment: paper_table(experiment) for experiment in ("simulated", "real")},
         "sets": [
             {
                 "title": SET_TITLES.get(one.name, one.name),

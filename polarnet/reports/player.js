@@ -91,6 +91,9 @@ class Player {
       ...map, kind: "error",
       values: map.values.map((value, i) => Math.abs(value - truth.values[i]) / FULL_ERROR),
     }));
+    for (const map of maps.filter((one) => one.kind === "aolp")) {
+      map.pale = maps.find((one) => one.source === map.source && one.kind === "dolp")?.values;
+    }
     this.maps = [...maps, ...errors];
     const measured = truth ? [truth] : maps.filter((map) => map.kind === "dolp");
     this.range = Math.max(0, ...measured.map((map) => range(map.values)));
@@ -157,26 +160,27 @@ class Player {
     const number = (kind, full) => `${Number((full * this.end(kind)).toFixed(2))}`;
     const ends = {
       events: ["darker (OFF)", "brighter (ON)"], dolp: ["DoLP 0", number("dolp", 1)], error: ["error 0", number("error", FULL_ERROR)],
-      aolp: ["AoLP 0° (to the right)", "180°"],
+      aolp: ["AoLP 0° (to the right), paler where DoLP is small", "180°"],
     };
     const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => ends[kind]);
     this.find("legend").replaceChildren(...kinds.map((kind) => {
       const entry = document.createElement("span"), bar = document.createElement("canvas");
       Object.assign(bar, { width: 128, height: 1, className: "bar" });
       bar.setAttribute("aria-hidden", "true");
-      this.paint(bar, kind, Float32Array.from({ length: 128 }, (_, i) => (2 * i + 1) * this.end(kind)), 0);
+      this.paint(bar, { kind, values: Float32Array.from({ length: 128 }, (_, i) => (2 * i + 1) * this.end(kind)) }, 0);
       entry.append(ends[kind][0], bar, ends[kind][1]);
       return entry;
     }));
   }
 
-  /** Colour one byte a pixel. */
-  paint(canvas, kind, values, frame) {
+  /** Colour one byte a pixel; AoLP is paler where the DoLP beside it is small. */
+  paint(canvas, { kind, values, pale }, frame) {
     const context = canvas.getContext("2d"), size = canvas.width * canvas.height, table = this.colours[kind];
     const image = context.createImageData(canvas.width, canvas.height), top = table.length / 3, full = 256 * this.end(kind);
     for (let i = 0; i < size; i++) {
       const entry = 3 * Math.min(top - 1, Math.floor(values[frame * size + i] / full * top));
-      for (const k of [0, 1, 2]) image.data[4 * i + k] = table[entry + k];
+      const saturation = pale ? Math.min(1, pale[frame * size + i] / 255 / this.end("dolp")) : 1;
+      for (const k of [0, 1, 2]) image.data[4 * i + k] = 255 - saturation * (255 - table[entry + k]);
       image.data[4 * i + 3] = 255;
     }
     context.putImageData(image, 0, 0);
@@ -190,7 +194,7 @@ class Player {
     const ms = `${this.scene.ms[this.frame]} ms`;
     this.find("ms").textContent = ms;
     this.find("time").setAttribute("aria-valuetext", ms);
-    for (const pane of this.panes) this.paint(pane.canvas, pane.map.kind, pane.map.values, this.frame);
+    for (const pane of this.panes) this.paint(pane.canvas, pane.map, this.frame);
     this.read(false);
   }
 

@@ -6,7 +6,7 @@ sine of twice the angle, because a lossy picture of the angle itself would blur 
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -18,11 +18,12 @@ import torch
 from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
+from torch import Tensor
 
 from polarnet.reports.legend import Legend, with_structure
-from polarnet.reports.maps import DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
+from polarnet.reports.maps import AOLP_TABLE, DOLP_TABLE, EVENT_TABLE, event_full_scale, table_of
 from polarnet.runtime.files import replaced
-from polarnet.storage.panels import NO_EVENTS, Panel
+from polarnet.storage.panels import NO_EVENTS, Panel, angle_bytes, fraction_bytes, signed_bytes
 from polarnet.terminal.progress import ProgressBar
 
 Kind = Literal["events", "s0", "dolp", "aolp"]
@@ -32,12 +33,16 @@ MAX_FRAMES = 24  # with two maps a frame, MAX_SIDE * MAX_FRAMES stays below the 
 MAX_STRIP_BYTES = 28_000_000  # of all strips: a page with charts and tables stays below 30 MB
 QUALITY: Mapping[Kind, int] = {"events": 50, "s0": 60, "dolp": 55, "aolp": 20}
 TRUTH = "truth"
+TO_BYTES: Mapping[Kind, Callable[[Tensor], Tensor]] = {
+    "events": signed_bytes, "s0": fraction_bytes, "dolp": fraction_bytes, "aolp": angle_bytes,
+}  # fmt: skip
+"""From the values of a quantity to the bytes of its maps."""
 
 COLOURS = {
     "events": EVENT_TABLE,
     "s0": table_of(matplotlib.colormaps["gray"]),
     "dolp": DOLP_TABLE,
-    "aolp": table_of(matplotlib.colormaps["twilight"]),  # cyclic and perceptually uniform
+    "aolp": AOLP_TABLE,
     "error": table_of(matplotlib.colormaps["magma"]),
 }
 
@@ -114,7 +119,7 @@ def write_player(
     video: str | None = None,
 ) -> Path:
     """Write a page with the player, and below it `facts`; `video` names a file beside the page."""
-    player = embedded_json(player_data(films)) if films else None
+    player = embedded_json(player_data(films))
     page = template("viewer.html.jinja").render(
         title=title, player_json=player, facts=facts, notes=notes, video=video, script=script
     )

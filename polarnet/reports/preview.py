@@ -1,7 +1,4 @@
-"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and videos of them: H.264, MP4.
-
-`plot_prediction` returns a picture that a notebook shows and that `save` writes.
-"""
+"""Labelled pictures of a sequence, side by side (events, DoLP, AoLP, S0, polarization), and MP4 videos of them."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -22,14 +19,14 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.reports.maps import (
     DOLP_TABLE,
-    EventScale,
     angle_image,
     dolp_image,
+    event_full_scale,
     event_image,
     intensity_image,
     polarization_hsv,
 )
-from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
+from polarnet.stokes import POLARIZER_ANGLES_DEG
 from polarnet.storage.frames import Polarization
 from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import ProgressBar
@@ -45,6 +42,7 @@ FONT_SIZE = 13  # pixels
 LINE = 22  # height of a line of text
 BAR = (120, 10)  # width and height of the colour bar of DoLP
 TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
+SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
 
 Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
@@ -113,12 +111,14 @@ class Sheet:
         longer = max(height, width)
         zoom = -(-MIN_PANEL // longer) if longer < MIN_PANEL else min(1.0, MAX_PANEL / longer)
         self._size = round(height * zoom), round(width * zoom)
-        self._scale = EventScale()
+        self._scale: float | None = None
 
     def events(self, sums: Float[Tensor, "n h w"]) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Maps of ON minus OFF events, coloured on one scale."""
-        scale = self._scale.after(sums)
-        return [event_image(image, scale) for image in sums]
+        """Maps of ON minus OFF events, coloured on one scale, which follows the number of events slowly."""
+        present = event_full_scale(sums)
+        inertia = 0.0 if self._scale is None else SCALE_INERTIA
+        self._scale = inertia * (self._scale or 0.0) + (1 - inertia) * present
+        return [event_image(image, self._scale) for image in sums]
 
     def picture(self, rows: Sequence[Captioned], foot: str) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Rows of captioned maps above a line of text and the colour bar of DoLP, with even sides."""
@@ -208,25 +208,6 @@ def foot_of(span_us: tuple[int, int], count: int) -> str:
     """Line of text below a picture: the time span of its events, their number, and their colours."""
     start, stop = (time / 1000 for time in span_us)
     return f"{start:.1f} to {stop:.1f} ms    {count:,} events    ON red, OFF blue"
-
-
-def plot_prediction(prediction: Prediction, dolp: Float[Tensor, "h w"] | None = None) -> Image.Image:
-    """DoLP, AoLP and the expected error of one predicted frame, with the true `dolp` and the error if it is given.
-
-    >>> import torch
-    >>> from polarnet.reports import plot_prediction
-    >>> from polarnet.stokes import Prediction
-    >>> plot_prediction(Prediction(torch.rand(20, 30)), torch.rand(20, 30)).mode
-    'RGB'
-    """
-    captioned = {"DoLP": dolp_image(prediction.dolp)}
-    if prediction.aolp is not None:
-        captioned["AoLP (hue), DoLP (saturation)"] = angle_image(prediction.dolp, prediction.aolp)
-    if prediction.log_variance is not None:
-        captioned["expected error"] = dolp_image(torch.exp(prediction.log_variance / 2))
-    if dolp is not None:
-        captioned |= {"true DoLP": dolp_image(dolp), "error": dolp_image((prediction.dolp - dolp).abs())}
-    return Image.fromarray(Sheet(*prediction.dolp.shape).picture([captioned], ""))
 
 
 @functools.lru_cache(maxsize=64)

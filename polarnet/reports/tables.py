@@ -57,19 +57,6 @@ SET_TITLES = {
 }
 """Test sets, in the order of every page."""
 
-PAPER_LABELS = {**LABELS, "e2v": "E2V, default parameters", "cf": "CF, default parameters"}
-PAPER_TABLE_2: Mapping[str, Scores] = {  # Yan et al., Photonics 2024, 11(5), 481
-    "simulated": {
-        "cf": {"mse": 0.1371, "psnr": 10.60, "ssim": 0.1667, "lpips": 0.5890},
-        "e2v": {"mse": 0.0778, "psnr": 12.74, "ssim": 0.3068, "lpips": 0.4140},
-        "paper": {"mse": 0.0355, "psnr": 15.56, "ssim": 0.3947, "lpips": 0.3295},
-    },
-    "real": {
-        "cf": {"mse": 0.0087, "psnr": 23.17, "ssim": 0.4116, "lpips": 0.3342},
-        "e2v": {"mse": 0.0134, "psnr": 20.02, "ssim": 0.3819, "lpips": 0.3350},
-        "paper": {"mse": 0.0026, "psnr": 27.48, "ssim": 0.5189, "lpips": 0.1369},
-    },
-}
 WINDOW_RULE = (
     "A window is the events between two frames of the truth, start included and end excluded; its truth is the frame "
     "at its end."
@@ -141,11 +128,6 @@ def score_table(
     if len(ranked) < len(methods):
         notes.append(ANOTHER_CAMERA)
     return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
-
-
-def paper_table(experiment: Literal["simulated", "real"]) -> Table:
-    """Published figures: one of the two experiments in the paper's Table 2."""
-    return score_table(PAPER_TABLE_2[experiment], labels=PAPER_LABELS)
 
 
 def as_plain(table: Table) -> str:

@@ -14,16 +14,15 @@ from polarnet.events.representations import polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.arrangements import Open, open_plain
 from polarnet.recordings.recording import is_recording, open_recording
-from polarnet.reports.player import MAX_FRAMES, Film, Kind, Map
+from polarnet.reports.player import MAX_FRAMES, TO_BYTES, TRUTH, Film, Kind, Map
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore, dequantise
 from polarnet.storage.groups import open_group
-from polarnet.storage.panels import angle_bytes, fraction_bytes, signed_bytes
 from polarnet.storage.scenes import SceneStore
 
 MAX_FILMS = 12  # sequences of a store shown without a choice
-APPENDED: Mapping[str, Kind] = {"s0": "s0", "intensity": "s0", "dolp": "dolp", "aolp": "aolp"}
-"""Quantity of each array of recovered.zarr and truth.zarr."""
+APPENDED: Sequence[Kind] = ("s0", "dolp", "aolp")
+"""Arrays of recovered.zarr and truth.zarr that are shown, each named after its quantity."""
 
 
 def films_of(path: Path, sequences: Sequence[str] = (), open_file: Open = open_recording) -> list[Film]:
@@ -99,28 +98,24 @@ def _events_film(name: str, channels: Sequence[Events], times_us: Sequence[int] 
         times_us = np.linspace(start, stop, MAX_FRAMES + 1).round().astype(int).tolist()
     spans = list(itertools.pairwise(times_us))
     sums = [torch.stack([polarity_sums(slice_time(events, *span)) for events in channels]).sum(0) for span in spans]
-    return Film(name, [stop for _, stop in spans], [Map("Events", "events", signed_bytes(torch.stack(sums)).numpy())])
+    return Film(name, [stop for _, stop in spans], _maps("Events", {"events": torch.stack(sums)}))
 
 
 def _truth(s0: Tensor, dolp: Tensor, aolp: Tensor) -> list[Map]:
-    return _maps("truth", {"s0": fraction_bytes(s0), "dolp": fraction_bytes(dolp), "aolp": angle_bytes(aolp)})
+    return _maps(TRUTH, {"s0": s0, "dolp": dolp, "aolp": aolp})
 
 
 def _appended_film(path: Path) -> Film:
     """A recovery or the truth of a simulation, from its growing arrays: frames spread evenly over them."""
     group = zarr.open_group(path, mode="r")
-    arrays: dict[str, Any] = {name: group[name] for name in ("t_us", *APPENDED) if name in group}
-    if "t_us" not in arrays or len(arrays) < 2:
+    arrays: dict[Kind, Any] = {name: group[name] for name in APPENDED if name in group}
+    if "t_us" not in group or not arrays:
         raise ValueError(f"{path}: expected arrays t_us and dolp, or a store of polarnet; got {sorted(group.keys())}")
-    places = np.unique(np.linspace(0, arrays["t_us"].shape[0] - 1, MAX_FRAMES).round().astype(int))
-    t_us = arrays.pop("t_us")[:][places].tolist()
-    frames = {APPENDED[name]: np.stack([array[int(k)] for k in places]) for name, array in arrays.items()}
-    read = {
-        kind: (angle_bytes if kind == "aolp" else fraction_bytes)(dequantise(kind, steps))
-        for kind, steps in frames.items()
-    }
-    return Film(path.parent.name, t_us, _maps("truth" if path.stem == "truth" else path.stem, read))
+    times: Any = group["t_us"]
+    places = np.unique(np.linspace(0, times.shape[0] - 1, MAX_FRAMES).round().astype(int))
+    read = {kind: dequantise(kind, np.stack([one[int(k)] for k in places])) for kind, one in arrays.items()}
+    return Film(path.parent.name, times[:][places].tolist(), _maps(path.stem, read))
 
 
 def _maps(source: str, values: Mapping[Kind, Tensor]) -> list[Map]:
-    return [Map(source, kind, frames.numpy()) for kind, frames in values.items()]
+    return [Map(source, kind, TO_BYTES[kind](frames).numpy()) for kind, frames in values.items()]

@@ -4,10 +4,10 @@ import functools
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
-from queue import Empty, SimpleQueue
+from contextlib import contextmanager
+from itertools import zip_longest
 from typing import Any, TypeVar
 
 from polarnet.runtime.machine import end_with_parent, limit_threads, on_one_thread, tune, usable_cores
@@ -15,7 +15,7 @@ from polarnet.terminal.installation import installation
 from polarnet.terminal.progress import ProgressBar as Bar
 from polarnet.terminal.progress import within
 
-ATTEMPTS = 4  # Dask's own limit for a task whose workers die (allowed-failures 3)
+ATTEMPTS = 4  # of Dask for a task whose workers die (its allowed-failures of 3)
 POLL_S = 0.2  # between two looks at the progress of worker processes
 BAR = "{l_bar}{bar}| {n:.4g}/{total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 
@@ -35,8 +35,8 @@ def pmap(
 
     The bar also moves inside an item, by `polarnet.terminal.progress.steps`, unless a Dask worker runs it. `address`
     names a Dask scheduler (extra `cluster`); without it, `workers` processes share the items, and one worker means this
-    process. Items of a worker that dies are handed out again. RuntimeError names the unfinished items after `ATTEMPTS`
-    deaths without a result, or a scheduler that has ended; exceptions of `function` end the map unchanged.
+    process. RuntimeError names the unfinished items after a worker process has died, or a scheduler that has ended;
+    exceptions of `function` end the map unchanged.
     """
     with Bar(total=len(items), desc=label, unit="", bar_format=BAR) as bar:
         if address is not None:
@@ -48,27 +48,6 @@ def pmap(
             with within(bar.update):
                 results.append(function(item))
         return results
-
-
-def _over_processes(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int, bar: Bar, label: str
-) -> list[Result]:
-    results: dict[int, Result] = {}
-    deaths = 0
-    while len(results) < len(items):
-        before = len(results)
-        try:
-            _collect(function, items, workers, results, bar)
-        except BrokenProcessPool:
-            deaths = 1 if len(results) > before else deaths + 1
-            undone = [items[i] for i in range(len(items)) if i not in results]
-            if deaths >= ATTEMPTS:
-                raise RuntimeError(
-                    f"{label}: worker processes died {deaths} times in a row (out of memory?) with these undone: "
-                    f"{', '.join(map(str, undone[:8]))}; run again with runtime.workers=1 to see which one it is"
-                ) from None
-            bar.write(f"{label}: a worker process died; {len(undone)} items are given out again")
-    return [results[i] for i in range(len(items))]
 
 
 def _start_worker(threads: int, done: Any) -> None:
@@ -91,37 +70,37 @@ def _in_worker(function: Callable[[Item], Result], item: Item) -> Result:
         return function(item)
 
 
-def _collect(
-    function: Callable[[Item], Result],
-    items: Sequence[Item],
-    workers: int,
-    results: dict[int, Result],
-    bar: Bar,
-) -> None:
-    """Add the missing entries of `results`, until all are there or the pool breaks."""
+def _over_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int, bar: Bar, label: str
+) -> list[Result]:
     spawn = multiprocessing.get_context("spawn")  # forking a process with running OpenMP threads can hang
     threads = max(1, usable_cores() // workers)
     try:
-        done = spawn.Value("d", len(results))
+        done = spawn.Value("d", 0.0)
         executor = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(threads, done))
     except OSError as error:
         raise RuntimeError(
             f"several processes need semaphores in /dev/shm, which cannot be made there: {error}; run again with "
             "runtime.workers=1"
         ) from error
+    futures: list[Future[Result]] = []
     with executor as pool:
         try:
             with _interrupts_held():  # by the workers too, until they are set up: their imports would show tracebacks
-                undone = [i for i in range(len(items)) if i not in results]
-                futures = {pool.submit(_in_worker, function, items[i]): i for i in undone}
-            finished: SimpleQueue[Future] = SimpleQueue()
-            for future in futures:
-                future.add_done_callback(finished.put)
-            while len(results) < len(items):
-                with suppress(Empty):
-                    future = finished.get(timeout=POLL_S)
-                    results[futures[future]] = future.result()
+                futures += (pool.submit(_in_worker, function, item) for item in items)
+            waiting = set(futures)
+            while waiting:
+                finished, waiting = wait(waiting, POLL_S, FIRST_EXCEPTION)
                 bar.update(done.value - bar.n)
+                for future in finished:
+                    future.result()
+            return [future.result() for future in futures]
+        except BrokenProcessPool:
+            undone = [str(item) for item, one in zip_longest(items, futures) if one is None or one.exception()]
+            raise RuntimeError(
+                f"{label}: a worker process died (out of memory?) with these undone: {', '.join(undone[:8])}; run "
+                "again, which makes what is missing, with fewer runtime.workers if memory is short"
+            ) from None
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 for worker in multiprocessing.active_children():

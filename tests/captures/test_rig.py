@@ -13,10 +13,10 @@ from polarnet.captures.targets import calibrate_targets
 from polarnet.config.pipeline import context_of, made_set
 from polarnet.config.tree import load
 from polarnet.pictures.dead_leaves import dead_leaves
-from polarnet.recovery.inputs import Files, open_files
 from polarnet.reports.recordings import draw_calibration
 from polarnet.simulation.motion import render
 from polarnet.simulation.scene import scene_from_rgb
+from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from studies.simulated_rig import RigConfig, write_rig
 
@@ -70,13 +70,10 @@ def calibrated(rig, config, tmp_path_factory):
     return folder / "out", found, truth
 
 
-def test_the_rig_writes_eight_captures_that_go_into_recover_calibrated(rig, config, project_root, tmp_path):
-    root, _ = rig
-    source = open_files(Files([root / "one"], captures=config), tmp_path)
-    pieces = list(source.pieces)
-    assert (source.height, source.width) == tuple(config.size)
-    assert min(map(len, pieces[0].channels)) > 0
-    assert 0 <= min(int(events.t[0]) for events in pieces[0].channels) <= pieces[-1].until_us
+def test_the_rig_writes_eight_captures_whose_events_are_calibrated(rig, calibrated, config):
+    events = EventStore.open(calibrated[0] / "events.zarr")
+    assert (events.height, events.width) == tuple(config.size)
+    assert min(events.count("one")) > 0
     root, truth = rig
     assert len(find_captures(root / "one")) == 8
     assert len(set(truth.start_us.values())) == 8  # random delays

@@ -73,9 +73,10 @@ def test_verify_of_something_else_says_what_was_expected_and_a_name_that_is_not_
 
 
 MISSING = [
-    "recover nofile", "recover . --truth nofile", "inspect nofile", "view nofile", "video nofile", "replay nofile lake",
-    "verify nofile", "simulate nofile seed=2", "convert nofile out.h5", "fit-sensor --name lab --flicker . nofile",
-    "onnx out.onnx --weights nofile", "benchmark --scenes nofile", "benchmark --recordings nofile",
+    "recover nofile", "recover . --truth nofile", "recover-rotating nofile", "inspect nofile", "view nofile",
+    "video nofile", "replay nofile lake", "verify nofile", "simulate nofile seed=2", "convert nofile out.h5",
+    "fit-sensor --name lab --flicker . nofile", "onnx out.onnx --weights nofile", "benchmark --scenes nofile",
+    "benchmark --recordings nofile",
 ]  # fmt: skip
 
 
@@ -97,7 +98,7 @@ def test_an_input_that_does_not_exist_is_refused_before_any_library_is_imported(
     [
         ("recovr x", "'benchmark'); did you mean 'recover'? (see polarnet --help)"),
         ("recover x --mosiac 1", "unrecognized arguments: --mosiac 1; did you mean '--mosaic'? (see polarnet recover"),
-        ("recover x --write pgn", "did you mean 'png'?"),
+        ("recover x --write mp3", "did you mean 'mp4'?"),
         ("recover x --zzz", "unrecognized arguments: --zzz (see polarnet recover --help)"),
     ],
 )

@@ -277,16 +277,7 @@ def test_an_alias_bomb_is_refused_at_once(tmp_path, last):
 E2P = "+rows.e2p={needs: data/train/e2p, settings: benchmark.precision}"
 
 
-def test_the_paper_experiment_holds_the_papers_values(project_root):
-    config = load(project_root, ["experiment=paper"])
-    assert (config.ingest.height, config.ingest.width) == (400, 600)
-    assert (config.synthesize.sensor_height, config.synthesize.sensor_width) == (120, 180)
-    assert (config.synthesize.duration_s, config.synthesize.frame_rate_hz) == (1.0, 30.0)
-    assert (config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off) == (0.2, 0.2)
-    assert config.emulate.model == "v2e"  # "we use V2E in our experiments", section 3.1
-    assert (config.train.learning_rate, config.train.batch_size, config.train.epochs) == (1e-4, 2, 250)
-    assert (config.loss.mse, config.loss.ssim, config.loss.lpips) == (1.0, 1.0, 10.0)
-    assert (config.lpips.backbone, config.benchmark.lpips_backbone) == ("vgg", "vgg")
-    assert config.used_baselines == ["e2v"]  # E2P is trained only if a row asks for it
+def test_the_paper_experiment_trains_e2p_only_if_a_row_asks_for_it(project_root):
+    assert load(project_root, ["experiment=paper"]).used_baselines == ["e2v"]
     with_e2p = load(project_root, ["experiment=paper", "baselines.trained=[e2p]", "~rows.e2v", E2P])
     assert with_e2p.used_baselines == ["e2p"]

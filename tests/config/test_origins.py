@@ -8,7 +8,7 @@ import pytest
 
 from polarnet.benchmark.run import Benchmark
 from polarnet.benchmark.score import Cost
-from polarnet.config import pipeline, tables
+from polarnet.config import benchmark_tables, pipeline
 from polarnet.config.origins import ORIGIN, Run, digest, read_origin
 from polarnet.config.tree import Config, load
 
@@ -164,7 +164,7 @@ def test_a_row_without_weights_is_recorded_without_opening_a_test_set(project_ro
     assert {file.name for file in row.iterdir()} == {"row.json", "SHA256SUMS"}
     assert "no weights are given: add the row to section `rows`" in (row / "row.json").read_text()
     with pytest.raises(ValueError, match="expected at least one row that can run, got none"):
-        tables.collect_rows(load(project_root, [f"paths.data={tmp_path}", "benchmark.methods=[e2p]"]))
+        benchmark_tables.collect_rows(load(project_root, [f"paths.data={tmp_path}", "benchmark.methods=[e2p]"]))
 
 
 def test_a_baseline_is_trained_for_a_row_that_needs_it_and_a_row_takes_the_weights_of_its_entry(project_root, tmp_path):

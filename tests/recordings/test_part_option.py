@@ -16,8 +16,10 @@ COMMANDS = {
     "inspect": ("--out", "out"),
     "view": ("--out", "out.html", "--no-browser"),
     "convert": ("out.h5",),
-    "recover": ("--method", "highpass", "--window", "10ms", "--write", "zarr", "--out", "out"),
-}
+    "recover": (
+        "--mosaic", "90 45 / 135 0", "--method", "highpass", "--window", "10ms", "--write", "zarr", "--out", "out",
+    ),
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -45,8 +47,8 @@ def test_the_folder_of_a_bag_is_a_recording(folder, command):
 
 
 def test_the_folder_of_a_bag_is_read_behind_a_rotating_polarizer(folder):
-    assert main(["recover", "one", "--rotating", "50", "--height", "12", "--write", "zarr", "--out", "out"]) == 0
-    assert json.loads((folder / "out" / "run.json").read_text())["command"] == "polarnet recover"
+    assert main(["recover-rotating", "one", "--rate", "50", "--height", "12", "--out", "out"]) == 0
+    assert json.loads((folder / "out" / "run.json").read_text())["command"] == "polarnet recover-rotating"
 
 
 @pytest.mark.parametrize(
@@ -70,6 +72,6 @@ def test_inspect_writes_the_list_of_hot_pixels_that_recover_reads(folder, capsys
     assert main(["inspect", "e.txt", "--out", "out"]) == 0
     assert "hot pixels  out/e.txt.hot.txt, for --hot-pixels" in capsys.readouterr().out
     assert read_hot_pixels(folder / "out" / "e.txt.hot.txt", 12, 18).sum() == 1
-    recovered = ("--method", "highpass", "--window", "10ms", "--write", "zarr", "--out", "recovered")
-    assert main(["recover", "e.txt", *recovered, "--hot-pixels", "out/e.txt.hot.txt"]) == 0
+    (folder / "out" / "e.txt.hot.txt").rename(folder / "hot.txt")
+    assert main(["recover", "e.txt", *COMMANDS["recover"], "--hot-pixels", "hot.txt", "--out", "recovered"]) == 0
     assert "events of 1 hot pixels" in capsys.readouterr().out

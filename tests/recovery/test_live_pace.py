@@ -99,7 +99,7 @@ def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkey
     if step_us is None:
         assert sum(taken) == 15_000
     monkeypatch.undo()
-    facts = recover(camera, rule, "method", RecoveryWriter(tmp_path, ("zarr",), 30.0), iter(frames))
+    facts = recover(camera, rule, "method", RecoveryWriter(tmp_path, ("zarr",)), iter(frames))
     joined = [frame.window.joined for frame in frames if frame.window.joined > 1]
     assert facts["joined"].startswith(f"{sum(joined)} windows to {len(joined)} frames: the processor did not keep up")
 

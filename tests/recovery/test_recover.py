@@ -1,4 +1,3 @@
-import functools
 import io
 import itertools
 import re
@@ -14,14 +13,13 @@ from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import EventWindow, WindowRule
+from polarnet.methods import METHODS
 from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks import load_network, shipped_weights
-from polarnet.networks.base.checkpoint import save_checkpoint
-from polarnet.networks.e2v.firenet import FireNet
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
-from polarnet.recovery.inputs import Files, open_files
-from polarnet.recovery.stream import ChosenMethod, frames_of, open_method
+from polarnet.recovery.inputs import input_of, open_channels
+from polarnet.recovery.stream import frames_of, open_method
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
 
@@ -39,9 +37,8 @@ def write_lines(path, events):
     return path
 
 
-def opened(store, size=None):
-    """A sequence of a store, for which neither settings nor a folder are needed."""
-    return open_files(Files([store], sequence="lake"), store / "unused", size)
+def opened(store):
+    return input_of("lake", open_channels([store], sequence="lake"))
 
 
 def recovered(out):
@@ -120,10 +117,8 @@ def test_a_file_goes_through_the_network_several_windows_at_once_and_gives_the_s
         torch.testing.assert_close(one.prediction.dolp, other.prediction.dolp, atol=1e-5, rtol=1e-4)
 
 
-def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_lines(store, channels):
-    source = opened(store, (8, 10))
-    assert (source.height, source.width) == (8, 10)
-    *_, last = source.pieces
+def test_a_sequence_ends_with_its_last_event_and_is_replayed_as_lines(store, channels):
+    *_, last = opened(store).pieces
     assert last.until_us == DURATION_US
     head, _, lines = live_lines(channels)
     out = io.BytesIO()
@@ -141,11 +136,9 @@ def test_a_sequence_is_reduced_to_the_size_that_is_asked_for_or_replayed_as_line
     (("--sequence", "lake", "--method", "cf", "--step", "1s"), "events between windows would be lost"),
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors: there is no such file"),
-    (("--live", "--method", "cf", "--size", 8, 10), "--live: expected no --size"),
     (("--live", "--method", "cf", "--height", 70), "--live: expected no --height"),
     (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
-    (("--sequence", "lake", "--start-angle", 3), "without --rotating or --triggers: expected no --start-angle"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
     if "cuda:9" in arguments and torch.cuda.is_available():
@@ -156,45 +149,19 @@ def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, 
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("method", ["highpass", "e2v"])
-def test_reconstructed_intensity_is_the_video_of_a_camera_without_polarizers(
-    method, channels, tmp_path, at_root, capsys
-):
-    file = write_lines(tmp_path / "camera.txt", channels[1])
-    weights = []
-    if method == "e2v":
-        torch.manual_seed(0)
-        network, path = FireNet(5), tmp_path / "mine.safetensors"
-        save_checkpoint(path, network.state_dict(), {"network": "firenet", "config": {"bins": network.bins}})
-        weights = ["--weights", str(path)]
-    assert main(["recover", str(file), "--method", method, "--out", str(tmp_path / "out"), *weights]) == 0
-    assert (tmp_path / "out" / "recovered.mp4").stat().st_size > 0
-    group = zarr.open_group(tmp_path / "out" / "recovered.zarr", mode="r")
-    assert set(group.array_keys()) == {"t_us", "intensity"}
-    assert group["intensity"].shape == (3, HEIGHT, WIDTH)
-    assert "Intensity from events: camera.txt" in (tmp_path / "out" / "index.html").read_text()
-    four = [*[str(file)] * 4, "--angles", "0", "45", "90", "135"]  # the same light behind all
-    assert main(["recover", *four, "--method", method, "--out", str(tmp_path / "four"), *weights]) == 0
-    dolp = zarr.open_group(tmp_path / "four" / "recovered.zarr", mode="r")["dolp"][:]
-    assert not dolp.any()
-    capsys.readouterr()
-    assert main(["recover", str(file), "--method", f"{method}+gain", "--out", str(tmp_path / "gain"), *weights]) != 0
-    assert "is one file of events: say where the polarizers" in capsys.readouterr().err
-
-
 def test_a_second_recovery_replaces_the_first_and_other_files_are_refused(store, tmp_path, at_root, capsys):
     out, arguments = tmp_path / "out", ("recover", str(store), "--sequence", "lake", "--method", "highpass")
     arguments = (*arguments, "--out", str(out), "--write")
-    assert main([*arguments, "png", "mp4", "--window", "10ms"]) == 0
-    assert len(list((out / "png").iterdir())) == 10
-    assert main([*arguments, "png", "--window", "50ms"]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["index.html", "png", "recovered.png", "run.json"]
-    assert len(list((out / "png").iterdir())) == 2
+    assert main([*arguments, "zarr", "mp4", "--window", "10ms"]) == 0
+    assert len(recovered(out)["t_us"]) == 10
+    assert main([*arguments, "zarr", "--window", "50ms"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["index.html", "recovered.png", "recovered.zarr", "run.json"]
+    assert len(recovered(out)["t_us"]) == 2
     assert f"page        {out / 'index.html'}" in capsys.readouterr().out
-    assert main([*arguments, "png", "--window", "1s"]) == 1
-    assert len(list((out / "png").iterdir())) == 2
+    assert main([*arguments, "zarr", "--window", "1s"]) == 1
+    assert len(recovered(out)["t_us"]) == 2
     (tmp_path / "out" / "run.json").unlink()
-    assert main([*arguments, "png", "--window", "50ms"]) == 1
+    assert main([*arguments, "zarr", "--window", "50ms"]) == 1
     assert "contains files that `polarnet recover` did not write; name another folder" in capsys.readouterr().err
 
 
@@ -231,7 +198,8 @@ def test_what_a_very_short_recording_is_told_works(channels, tmp_path, at_root, 
 
 
 def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, capsys):
-    one = write_lines(tmp_path / "camera.txt", make_channel(1))
+    one, picture = write_lines(tmp_path / "camera.txt", make_channel(1)), tmp_path / "lake.JPG"
+    picture.touch()
     for files, reason in (
         ([one], "say where the polarizers of its pixels are"),
         ([one, one], "four files with --angles, got 2"),
@@ -242,6 +210,7 @@ def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, ca
         ([one, "--live", "--sequence", "lake"], "--live: expected no --sequence"),
         ([one, one, "--live"], "--live: expected one input, got 2"),
         ([tmp_path / "none.csv"], "there is no such file"),
+        ([picture], "lake.JPG is a picture, no recording: `polarnet simulate"),
     ):
         assert run(*files, "--method", "cf+gain", out=tmp_path / "out") == 1
         assert not (tmp_path / "out").exists()
@@ -249,12 +218,12 @@ def test_files_of_no_arrangement_are_refused(make_channel, tmp_path, at_root, ca
 
 
 def test_the_shipped_network_takes_the_thresholds_of_the_camera_and_other_methods_do_not(project_root):
-    setup_of_demo = functools.partial(setup_of, load(project_root, ["runtime.device=cpu"]))
+    config, highpass, ours = load(project_root, ["runtime.device=cpu"]), METHODS["highpass"], METHODS["ours"]
     for option, value in (("thresholds", (0.1, 0.1)), ("binning", 2)):
         with pytest.raises(ValueError, match=f"--{option} is for the DoLP network, highpass does not use it"):
-            open_method(ChosenMethod("highpass", **{option: value}), setup_of_demo)
+            open_method(highpass, setup_of(config, highpass), settings={option: value})
     windows = [EventWindow([Events.empty(HEIGHT, WIDTH)] * 4, 0, 33_333)]
-    recoverer, words = open_method(ChosenMethod("ours", thresholds=(0.1, 0.4)), setup_of_demo)
+    recoverer, words = open_method(ours, setup_of(config, ours), settings={"thresholds": (0.1, 0.4)})
     assert words.endswith(str(shipped_weights()))
     assert recoverer.step(recoverer.start(HEIGHT, WIDTH), windows)[1].dolp.shape == (1, HEIGHT, WIDTH)
 

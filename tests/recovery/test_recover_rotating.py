@@ -30,13 +30,13 @@ def recording(tmp_path):
 
 
 def recovered(arguments, out):
-    assert main(["recover", *map(str, arguments), "--out", str(out), "--write", "zarr"]) == 0
+    assert main(["recover-rotating", *map(str, arguments), "--out", str(out)]) == 0
     group = zarr.open_group(out / "recovered.zarr", mode="r")
     return {name: group[name][:] for name in ("t_us", "dolp", "aolp", "log_variance")}
 
 
 def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, at_root):
-    frames = recovered([recording, "--rotating", RATE_HZ, "--start-angle", START_DEG], tmp_path / "a")
+    frames = recovered([recording, "--rate", RATE_HZ, "--start-angle", START_DEG], tmp_path / "a")
     assert frames["t_us"][:2].tolist() == [100_000, 200_000]
     assert frames["dolp"][-1].mean() / 65535 == pytest.approx(0.5, abs=0.05)
     assert frames["aolp"][-1].mean() * 180 / 65536 == pytest.approx(60, abs=3)
@@ -49,18 +49,11 @@ def test_a_recording_gives_dolp_and_aolp_every_half_turn(recording, tmp_path, at
     assert (by_trigger["aolp"][1::2] == frames["aolp"]).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "reason"),
-    [
-        (["--rotating", "5", "--mosaic", "90 45 / 135 0"], "one arrangement of polarizers, got --mosaic, --rotating"),
-        (["--rotating", "5", "--method", "cf"], "--rotating: expected no --method"),
-        (["--rotating", "5", "--window", "20ms"], "--rotating: expected no --window"),
-        (["--method", "rotating_polarizer"], "expected the rotation of the polarizer too: --rotating HZ"),
-    ],
-)
-def test_options_of_other_inputs_are_refused(recording, arguments, reason, capsys, at_root):
-    assert main(["recover", str(recording), *arguments]) == 1
-    assert reason in capsys.readouterr().err
+def test_without_a_rate_or_triggers_there_is_no_rotation_and_recover_has_no_such_method(recording, capsys, at_root):
+    assert main(["recover-rotating", str(recording)]) == 1
+    assert "expected the rate of the polarizer (--rate HZ) or its triggers" in capsys.readouterr().err
+    assert main(["recover", str(recording), "--method", "rotating_polarizer"]) == 1
+    assert "--method: expected a method of cf," in capsys.readouterr().err
 
 
 def test_a_rate_beside_triggers_gives_the_sense_of_rotation(tmp_path):

@@ -1,4 +1,3 @@
-import resource
 import shutil
 
 import cv2
@@ -36,23 +35,20 @@ def cores(request, monkeypatch):
 
 @pytest.fixture
 def written(tmp_path, cores):
-    with RecoveryWriter(tmp_path, ("zarr", "png", "mp4"), 30.0) as writer:
+    with RecoveryWriter(tmp_path, ("zarr", "mp4")) as writer:
         for k in range(FRAMES):
             writer.add(window(k), frame(k), live=True)
     writer.write_page("a & b", {"windows": "of 1 ms"}, ["one note"])
     return tmp_path
 
 
-def test_the_numbers_the_pictures_the_video_and_a_page_that_escapes_names_are_written(written):
+def test_the_numbers_the_video_and_a_page_that_escapes_names_are_written(written):
     group = zarr.open_group(written / "recovered.zarr", mode="r")
     assert group["t_us"][:].tolist() == [1000 * (k + 1) for k in range(FRAMES)]
     np.testing.assert_allclose(group["dolp"][:, 0, 0] / 65535, np.arange(FRAMES) / FRAMES, atol=1e-5)
     np.testing.assert_allclose(group["aolp"][:, 3, 4] * np.pi / 65536, 0.05 * np.arange(FRAMES), atol=1e-4)
     np.testing.assert_allclose(group["log_variance"][:, 3, 4], -np.arange(FRAMES) / FRAMES, rtol=1e-6)
     assert set(group.attrs["conventions"]) == {"t_us", "dolp", "aolp", "log_variance"}
-    picture = cv2.imread(str(written / "png" / "000039.png"))
-    assert picture.shape == (16, 72, 3)  # 3 * 21 + 2 * 4, brought to even sides
-    assert len(list((written / "png").iterdir())) == FRAMES
     video, count = cv2.VideoCapture(str(written / "recovered.mp4")), 0
     while video.read()[0]:
         count += 1
@@ -68,7 +64,7 @@ def test_the_numbers_the_pictures_the_video_and_a_page_that_escapes_names_are_wr
 
 
 def test_without_an_angle_two_maps_are_shown_and_nothing_else_is_written(tmp_path):
-    with RecoveryWriter(tmp_path, ("zarr",), 30.0) as writer:
+    with RecoveryWriter(tmp_path, ("zarr",)) as writer:
         for k in range(3):
             writer.add(window(k), frame(k, angle=False))
     writer.write_page("x", {}, [])
@@ -82,21 +78,10 @@ def test_a_full_disk_stops_at_a_whole_frame_and_says_so(tmp_path, cores, monkeyp
     monkeypatch.setattr(recovery.shutil, "disk_usage", lambda _: usage._replace(free=next(free)))
 
     def write() -> None:
-        with RecoveryWriter(tmp_path, ("zarr", "png"), 30.0) as writer:
+        with RecoveryWriter(tmp_path, ("zarr",)) as writer:
             for k in range(FRAMES):
                 writer.add(window(k), frame(k), live=True)
 
     with pytest.raises(OSError, match=r"the disk is full; all 3 frames"):
         write()
-    assert [cv2.imread(str(path)).shape for path in sorted((tmp_path / "png").iterdir())] == [(16, 72, 3)] * 3
     assert zarr.open_group(tmp_path / "recovered.zarr", mode="r")["t_us"].shape == (3,)
-
-
-def test_a_picture_that_is_cut_off_is_an_error(tmp_path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (400, limits[1]))  # bytes of a file, as a quota or a full disk would
-    try:
-        with pytest.raises(OSError, match="File too large"), RecoveryWriter(tmp_path, ("png",), 30.0) as writer:
-            writer.add(window(0), frame(0))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

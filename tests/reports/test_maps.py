@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from polarnet.reports.maps import (
+    AOLP_TABLE,
+    angle_image,
     dolp_image,
     encode_png,
     event_full_scale,
@@ -24,6 +26,12 @@ def pixel(value):
 @pytest.mark.parametrize(("aolp_deg", "colour"), [(0, RED), (60, GREEN), (120, BLUE), (180, RED)])
 def test_fully_polarized_light_shows_its_angle_as_hue(aolp_deg, colour):
     assert tuple(polarization_hsv(pixel(1), pixel(1), pixel(math.radians(aolp_deg)))[0, 0]) == colour
+
+
+def test_a_page_that_blends_the_hues_with_white_has_the_colours_of_the_videos():
+    steps, dolp = torch.arange(256)[None], torch.linspace(0, 1, 11)[:, None].expand(11, 256)
+    blended = 255 - dolp[..., None].numpy() * (255.0 - AOLP_TABLE)  # as player.js does
+    assert abs(angle_image(dolp, math.pi * (steps / 256).expand(11, 256)) - blended).max() <= 1
 
 
 def test_the_papers_map_with_dolp_as_value_and_light_without_polarization():

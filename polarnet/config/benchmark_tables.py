@@ -1,4 +1,4 @@
-"""The tables of a configuration, put together from the results of its rows."""
+"""The benchmark's tables of a configuration, put together from the results of its rows."""
 
 import dataclasses
 import json

@@ -17,7 +17,7 @@ from polarnet.recordings.formats.celex5 import WHITE
 from polarnet.recordings.noise import Cleaner, Cleaning
 from polarnet.recordings.recording import detect_format, read_recording
 from polarnet.recordings.source import RecordingError
-from polarnet.recordings.truth import Truth, read_truth, truth_formats
+from polarnet.recordings.truth import Truth, check_size, read_truth, truth_formats
 from polarnet.stokes import Mosaic
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
@@ -26,6 +26,7 @@ from polarnet.terminal.progress import ProgressBar
 MAX_WINDOW_RATIO = 1.25  # between the frames' interval and the networks' window, beyond which a warning says so
 MIN_AGREEMENT = 0.1  # correlation of events and frames (`Lag.agreement`); below it their lag is not known
 MAX_LAG = 0.5  # frame intervals
+MAX_LISTED = 8  # files that a note names
 
 
 class Recorded(NamedTuple):
@@ -46,15 +47,20 @@ def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleani
     """
     if not root.is_dir():
         raise ValueError(f"{root}: expected a folder of recordings, got {'a file' if root.exists() else 'none'}")
-    recordings, notes = [], []
+    recordings, notes, others = [], [], []
     files = sorted(path for path in root.rglob("*") if path.is_file())
     for path in ProgressBar(files, "recordings", unit="file"):
         try:
-            if detect_format(path) not in truth_formats():
-                raise RecordingError(f"expected a format with frames, {', '.join(truth_formats())}")
-            recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning))
+            if _holds_frames(path):
+                recordings.append(read_recorded(path, path.relative_to(root).as_posix(), mosaic, cleaning))
+            else:
+                others.append(path.name)
         except RecordingError as error:
             notes.append(f"{path.name} was skipped: {str(error).removeprefix(f'{path.name}: ')}.")
+    if others:
+        more = f" and {len(others) - MAX_LISTED} more" if len(others) > MAX_LISTED else ""
+        names = f"{', '.join(others[:MAX_LISTED])}{more}"
+        notes.append(f"Skipped, because only files of {', '.join(truth_formats())} hold frames: {names}.")
     if not recordings:
         raise ValueError(f"{root}: no recording with true polarization. {' '.join(notes) or 'The folder is empty.'}")
     sizes = {one.truth.dolp.shape[1:] for one in recordings}
@@ -66,6 +72,14 @@ def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleani
     return [*notes, *(note for one in recordings for note in one.notes)]
 
 
+def _holds_frames(path: Path) -> bool:
+    """Whether a file has a format with frames."""
+    try:
+        return detect_format(path) in truth_formats()
+    except RecordingError:
+        return False
+
+
 def read_recorded(path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning) -> Recorded:
     """The four channels of a recording, without noise, and its frames; both last from the first frame to the last.
 
@@ -73,11 +87,7 @@ def read_recorded(path: Path, name: str, mosaic: Mosaic, cleaning: Cleaning) -> 
     three remain, as with different clocks, or if frames and sensor differ in size.
     """
     events, truth = read_recording(path).events, read_truth(path, mosaic)
-    if truth.light.shape[1:] != (events.height // 2 * 2, events.width // 2 * 2):
-        raise RecordingError(
-            f"{path.name}: expected frames of the sensor's {events.height}x{events.width} px, got "
-            f"{truth.light.shape[1]}x{truth.light.shape[2]}"
-        )
+    check_size(path, truth, events.height, events.width)
     first_us, last_us = (int(events.t[0]), int(events.t[-1])) if len(events) else (0, 0)
     interval_us = int(np.median(np.diff(truth.t_us))) if len(truth.t_us) > 1 else 0
     during = (truth.t_us >= first_us - interval_us) & (truth.t_us <= last_us + interval_us)

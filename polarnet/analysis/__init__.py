@@ -1,1 +1,0 @@
-"""Conditions of a comparison, and recordings with truth as a test set."""
