@@ -83,7 +83,7 @@ def finished(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
     Repo.init(str(folder), no_scm=True).close()
     with pytest.MonkeyPatch.context() as monkeypatch:
         enter(folder, monkeypatch)
-        assert repro(force=True) == set(pipeline(folder, YAML(typ="safe").load(folder / "params.yaml")))
+        assert repro() == set(pipeline(folder, YAML(typ="safe").load(folder / "params.yaml")))
     return folder
 
 
@@ -112,12 +112,12 @@ def enter(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
 
 
-def repro(force: bool = False) -> set[str]:
-    """Names of the stages that `dvc repro` runs in the current folder; with `force`, DVC looks for no earlier run."""
+def repro() -> set[str]:
+    """Names of the stages that `dvc repro` runs in the current folder."""
     from dvc.repo import Repo
 
     with Repo() as repo:
-        return {stage.name for stage in repo.reproduce(force=force)}
+        return {stage.name for stage in repo.reproduce()}
 
 
 def set_params(project: Path, change: Callable[[Any], None]) -> None:
