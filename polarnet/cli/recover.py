@@ -161,8 +161,6 @@ def check_options(options: argparse.Namespace) -> None:
         refuse(options, "--live", NOT_LIVE)
         if options.method == WHOLE_METHOD:
             raise ValueError(f"--live: {WHOLE_METHOD} waits for the whole recording; use --method {PAST_METHOD}")
-    if options.frames:
-        refuse(options, "--frames", ["step"])
     if options.live and len(options.input) != 1:
         raise ValueError(f"--live: expected one input, got {len(options.input)}")
     if not first.is_dir() or is_recording(first):
