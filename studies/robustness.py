@@ -7,6 +7,7 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `photographs`: a split (`experiment=photographs`) of --photographs; `photographs_large`: of both folders together.
 - `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
+- `layers.two`, `layers.turning`: the same photographs where they do not move as one plane (`studies.layers`).
 
 `ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
 --whole-file has `registered` in their place, the network over the whole recording. --frames has it, and for each
@@ -54,6 +55,7 @@ from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.stokes import Prediction, StokesFrames, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
+from studies import layers
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
 from studies.study import arguments_of, command_line, machine_record, write_section
 
@@ -132,6 +134,7 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
             conditions[f"measured.{name}"] = [(part_of(measured, work / name, "test", limit), ())]
     small = part_of(images["rgb"], work / "rgb", arguments.split, arguments.sensor_limit or limit)
     conditions |= {f"sensors.{name}": [(small, overrides)] for name, overrides in SENSORS.items()}
+    conditions |= {f"layers.{kind}": [(small, ())] for kind in layers.KINDS}
     return conditions | {"time.5ms": [(small, ("synthesize.frame_rate_hz=200",))]}
 
 
@@ -153,10 +156,16 @@ def contexts_of(
 
 
 def scored_sequence(
-    name: str, scenes: SceneStore, config: Config, contexts: Mapping[str, Context], constant: float, mode: str
+    name: str,
+    scenes: SceneStore,
+    config: Config,
+    contexts: Mapping[str, Context],
+    constant: float,
+    mode: str,
+    kind: str | None,
 ) -> Scores:
-    """Scores of all methods on one sequence, without the windows of the warm-up."""
-    test = simulated(scenes, name, config)
+    """Scores of all methods on one sequence, of the `kind` of layers if any, without the windows of the warm-up."""
+    test = layers.layered(scenes, name, config, kind) if kind else simulated(scenes, name, config)
     first_context = next(iter(contexts.values()))
     rows, _ = available(ROWS, first_context)
     predictions = predictions_of(rows, test, first_context)
@@ -344,6 +353,7 @@ def tables_of(
                 contexts=contexts,
                 constant=constant,
                 mode=mode,
+                kind=name.removeprefix("layers.") if name.startswith("layers.") else None,
             )
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
