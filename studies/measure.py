@@ -39,6 +39,7 @@ STUDIES = {
     ("robustness", "frames_test"): "studies.robustness --frames --conditions photographs measured " + LARGE,
     ("robustness", "whole_file_test"): "studies.robustness --whole-file --conditions photographs photographs_large "
     "measured " + LARGE,
+    ("robustness", "layers_test"): "studies.robustness --layers " + LARGE,
     ("robustness", "speed"): "studies.speed --only network --write",
     ("registration", "bounds"): f"studies.registration --work {{work}}/registration {SETS} --write",
     ("emulation", "models"): "studies.speed --only simulation --write",

@@ -7,14 +7,15 @@ python -m studies.robustness --photographs FOLDER [--photographs-large FOLDER] -
 - `photographs`: a split (`experiment=photographs`) of --photographs; `photographs_large`: of both folders together.
 - `measured.SOURCE`: all measured scenes of a folder, or of one repo in its manifest.csv (columns file, repo).
 - `sensors.NAME`: the scenes of `photographs` under each entry of SENSORS; `time.5ms`: with windows of 5 ms.
-- `layers.two`, `layers.turning`: the same photographs where they do not move as one plane (`studies.layers`).
+- `layers.two`, `layers.turning`: the same photographs where they do not move as one plane (`studies.layers`), scored
+  with --layers alone.
 
 `ours, 2x2 blocks` is the network on blocks of pixels, `ours, thresholds given` with the sensor's contrast thresholds.
---whole-file has `registered` in their place, the network over the whole recording. --frames has it, and for each
-entry of FRAMES_HZ the same with frames of the camera (`recover --frames`) and the frame nearest in time, held: frames
-of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. The complementary filter has them too.
-`train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all other
-sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
+--whole-file has `registered` in their place, the network over the whole recording; --layers too. --frames has it, and
+for each entry of FRAMES_HZ the same with frames of the camera (`recover --frames`) and the frame nearest in time, held:
+frames of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. The complementary filter has
+them too. `train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all
+other sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
 --sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
 docs/results/robustness.json. The second command fills --training with links to the training photographs of both
 folders: a network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
@@ -60,8 +61,9 @@ from studies.scored_pictures import ingested, link_training, mean_dolp, part_of,
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 OURS, WHOLE = "ours", "registered"
-PAST, WHOLE_FILE, FRAMES = "", "whole_file", "frames"
-"""What the network sees: events so far, those of the whole recording, or also frames; sections are named after them."""
+PAST, WHOLE_FILE, FRAMES, LAYERS = "", "whole_file", "frames", "layers"
+"""What the network sees: events so far, those of the whole recording, or also frames; or what it sees them of. Sections
+are named after them."""
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -381,6 +383,7 @@ def main() -> None:
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
     parser.add_argument("--whole-file", action="store_true", help="the row `registered` beside `ours`")
     parser.add_argument("--frames", action="store_true", help="the same, and with frames; needs measured scenes")
+    parser.add_argument("--layers", action="store_true", help="the conditions layers.*, and no others")
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
@@ -401,17 +404,22 @@ def main() -> None:
         if name.startswith("measured.")
     }
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
+    chosen = [name for name in (FRAMES, LAYERS, WHOLE_FILE) if getattr(arguments, name)]
+    mode = chosen[0] if chosen else PAST
     if wanted := arguments.conditions:
         conditions = {
             name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
         }
-    mode = FRAMES if arguments.frames else WHOLE_FILE if arguments.whole_file else PAST
+    conditions = {name: one for name, one in conditions.items() if name.startswith(LAYERS) == (mode == LAYERS)}
     tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, mode)
     if mode == FRAMES:
         rows = tables["measured"]["rows"]
         with_5, at_rate = rows[f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"], rows[between_row()]
         ratio, change = with_5["mse"] / rows[OURS]["mse"], at_rate["psnr"] - with_5["psnr"]
         figures = {FRAMES: {"mse_over_events_only": ratio, f"psnr_change_at_{BETWEEN_HZ}_hz": change}}
+    elif mode == LAYERS:
+        rows = {name: table["rows"] for name, table in tables.items()}
+        figures = {LAYERS: {name: of[WHOLE]["mse"] / of[OURS]["mse"] for name, of in rows.items()}}
     else:
         figures = {mode: headlines(tables, WHOLE)} if mode else headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
