@@ -1,5 +1,6 @@
 """Items that another thread prepares while this one works, such as the pieces of a recording."""
 
+import os
 from collections.abc import Iterable, Iterator
 from queue import Queue
 from threading import Thread
@@ -8,6 +9,7 @@ from typing import Generic, TypeVar
 import torch
 
 Item = TypeVar("Item")
+NICE = 10  # of the thread: the threads of a network wait for each other, so it slows down most where one gives way
 
 
 class Ahead(Generic[Item]):
@@ -47,6 +49,7 @@ class Ahead(Generic[Item]):
 
     def _fill(self, items: Iterable[Item]) -> None:
         torch.set_num_threads(1)  # more would put those of the network to sleep between operations
+        os.nice(NICE)  # Linux: of this thread alone
         end: BaseException = StopIteration()
         try:
             for item in items:
