@@ -177,7 +177,7 @@ def scored_sequence(
     if mode != PAST:
         predictions |= predictions_of([WHOLE], test, first_context)
     if mode == FRAMES:
-        predictions |= with_frames(scenes, test, first_context)
+        predictions |= with_frames(scenes, test, first_context, config.methods.cf)
     warmup = warmup_windows(config)
     scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
     first = scored_windows(test, warmup).start
@@ -193,7 +193,9 @@ def scored_sequence(
     return Scores(scores, {test.scene: float(truth.mean())}, errors)
 
 
-def with_frames(scenes: SceneStore, test: TestSequence, context: Context) -> dict[str, Prediction]:
+def with_frames(
+    scenes: SceneStore, test: TestSequence, context: Context, config: FilterConfig
+) -> dict[str, Prediction]:
     """`registered` with frames, and the nearest frame, for each rate of FRAMES_HZ."""
     predictions = {}
     method, windows = METHODS[WHOLE], test.windows_for(False)
@@ -205,7 +207,7 @@ def with_frames(scenes: SceneStore, test: TestSequence, context: Context) -> dic
         s1, s2 = frames.stokes[nearest].unbind(1)
         aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
         predictions[f"nearest of {rate_hz} frames/s"] = Prediction(torch.hypot(s1, s2).clamp(max=1), aolp)
-        predictions[f"cf, {rate_hz} frames/s"] = filtered_with(frames, test, context.setups["cf"].config)
+        predictions[f"cf, {rate_hz} frames/s"] = filtered_with(frames, test, config)
     return predictions
 
 
