@@ -1,4 +1,4 @@
-"""Sequences that do not move as one plane, which `studies.robustness --conditions layers` scores."""
+"""Sequences that do not move as one plane, which `studies.robustness --layers` scores."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -36,15 +36,16 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from polarnet.benchmark.rows import Context, available, predicted_over, predictions_of
+from polarnet.benchmark.rows import Context, available, predictions_of
 from polarnet.benchmark.score import FrameScore, scene_means, score_sequence, scored_windows
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.pipeline import context_of
 from polarnet.config.tree import Config
 from polarnet.events.stream import Events, slice_time
 from polarnet.methods import METHODS
-from polarnet.methods.complementary_filter import FilterConfig, FilterState, at_rest, integrate
+from polarnet.methods.complementary_filter import FilterState, at_rest, integrate
 from polarnet.methods.intensities import from_intensities
+from polarnet.methods.method import Recoverer, State
 from polarnet.metrics.reliability import Reliability, reliability
 from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
@@ -54,7 +55,7 @@ from polarnet.simulation.event_sets import motion_over
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
 from polarnet.simulation.truth import frames_of, valid_frames
-from polarnet.stokes import Prediction, StokesFrames, stokes_from_intensities
+from polarnet.stokes import Prediction, StokesFrames, intensities_from_stokes, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore
 from studies import layers
 from studies.scored_pictures import ingested, link_training, mean_dolp, part_of, scenes_of, settings, sources_of
@@ -62,8 +63,8 @@ from studies.study import arguments_of, command_line, machine_record, write_sect
 
 OURS, WHOLE = "ours", "registered"
 PAST, WHOLE_FILE, FRAMES, LAYERS = "", "whole_file", "frames", "layers"
-"""What the network sees: events so far, those of the whole recording, or also frames; or what it sees them of. Sections
-are named after them."""
+"""Modes, after which sections are named: the network sees events so far, those of the whole recording, or also frames;
+or scenes of layers."""
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -74,7 +75,7 @@ BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`reco
 BETWEEN_US = 12_500  # time between those that are scored, every 25th
 EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
 FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
-FILTER_HZ, CONTRAST = 5.0, 0.2  # cutoff of that filter, of 0.1, 0.5, 2 and 5 Hz the best on validation photographs
+FILTER_HZ = 5.0  # cutoff of that filter, of 0.1, 0.5, 2 and 5 Hz the best on validation photographs
 SMALLEST_SHARE = 0.01  # of light behind a polarizer, of all
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 SENSORS: dict[str, tuple[str, ...]] = {
@@ -176,13 +177,13 @@ def scored_sequence(
         predictions[row] = predictions_of([OURS], test, context)[OURS]
     if mode != PAST:
         predictions |= predictions_of([WHOLE], test, first_context)
-    if mode == FRAMES:
-        predictions |= with_frames(scenes, test, first_context, config.methods.cf)
-    warmup = warmup_windows(config)
-    scores = score_sequence(test, predictions, warmup, None, torch.device("cpu"))
+    warmup, between = warmup_windows(config), []
     first = scored_windows(test, warmup).start
     if mode == FRAMES:
-        scores += score_sequence(*between_windows(scenes, test, first_context, first), 0, None, torch.device("cpu"))
+        of_frames, truth_between, at_rate = with_frames(scenes, test, first_context, config, first)
+        predictions |= of_frames
+        between = score_sequence(truth_between, at_rate, 0, None, torch.device("cpu"))
+    scores = score_sequence(test, predictions, warmup, None, torch.device("cpu")) + between
     valid = None if test.valid is None else test.valid[first:]
     errors = {
         row: reliability(one.log_variance[first:], one.dolp[first:], test.dolp[first:], valid)
@@ -194,38 +195,44 @@ def scored_sequence(
 
 
 def with_frames(
-    scenes: SceneStore, test: TestSequence, context: Context, config: FilterConfig
-) -> dict[str, Prediction]:
-    """`registered` with frames, and the nearest frame, for each rate of FRAMES_HZ."""
-    predictions = {}
+    scenes: SceneStore, test: TestSequence, context: Context, config: Config, first: int
+) -> tuple[dict[str, Prediction], TestSequence, dict[str, Prediction]]:
+    """`registered`, the nearest frame and the filter for each rate of FRAMES_HZ, and `between_windows`."""
+    predictions, between = {}, None
     method, windows = METHODS[WHOLE], test.windows_for(False)
     for rate_hz in FRAMES_HZ:
         frames = camera_frames(scenes, test.name, int(test.t_us[-1]), rate_hz)
         recoverer = method.open(replace(context.setups[method.section], frames=frames))
-        predictions[f"{WHOLE}, {rate_hz} frames/s"] = predicted_over(recoverer, windows)
+        state, predictions[f"{WHOLE}, {rate_hz} frames/s"] = recoverer.step(
+            recoverer.start(*test.dolp.shape[-2:]), windows
+        )
         nearest = np.abs(frames.t_us - test.t_us[1:, None].numpy()).argmin(1)
         s1, s2 = frames.stokes[nearest].unbind(1)
         aolp = torch.remainder(torch.atan2(s2, s1) / 2, math.pi)
         predictions[f"nearest of {rate_hz} frames/s"] = Prediction(torch.hypot(s1, s2).clamp(max=1), aolp)
         predictions[f"cf, {rate_hz} frames/s"] = filtered_with(frames, test, config)
-    return predictions
+        if rate_hz == BETWEEN_FRAMES_HZ:
+            between = between_windows(scenes, test, recoverer, state, first)
+    assert between is not None
+    return predictions, *between
 
 
-def filtered_with(frames: StokesFrames, test: TestSequence, config: FilterConfig) -> Prediction:
+def filtered_with(frames: StokesFrames, test: TestSequence, config: Config) -> Prediction:
     """The complementary filter with frames (Scheerlinck, Barnes, Mahony, ACCV 2018), with the sensor's thresholds.
 
     The filter is linear in log intensity and DoLP knows no common factor, so frames of s1 and s2 alone serve it.
     """
-    config = replace(config, cutoff_hz=FILTER_HZ, contrast_on=CONTRAST, contrast_off=-CONTRAST)
-    s1, s2 = torch.where(frames.valid[:, None], frames.stokes, 0.0).double().unbind(1)
-    light = torch.stack([1 + s1, 1 + s2, 1 - s1, 1 - s2], dim=1) / 2
+    on, off = config.emulate.contrast_threshold_on, config.emulate.contrast_threshold_off
+    settings_of_filter = replace(config.methods.cf, cutoff_hz=FILTER_HZ, contrast_on=on, contrast_off=-off)
+    s1_s2 = torch.where(frames.valid[:, None], frames.stokes, 0.0).double()
+    light = intensities_from_stokes(torch.cat([torch.ones_like(s1_s2[:, :1]), s1_s2], dim=1))
     logs = light.clamp(min=SMALLEST_SHARE).log().numpy()
     state, shown, images = at_rest(4, *test.dolp.shape[-2:]), logs[0], []
     of_frames = [(int(t_us), number) for number, t_us in enumerate(frames.t_us)]
     for t_us, number in sorted([(int(t_us), -1) for t_us in test.t_us[1:]] + of_frames):
         new = [slice_time(events, state.t_us, t_us) for events in test.events]
-        state = integrate(state, new, t_us, config)
-        difference = state.log_intensity * np.exp(-config.rate_per_us * (t_us - state.updated_us))
+        state = integrate(state, new, t_us, settings_of_filter)
+        difference = state.log_intensity * np.exp(-settings_of_filter.rate_per_us * (t_us - state.updated_us))
         if number < 0:
             images.append(torch.from_numpy(np.exp(difference + shown)))
             continue
@@ -235,13 +242,10 @@ def filtered_with(frames: StokesFrames, test: TestSequence, config: FilterConfig
 
 
 def between_windows(
-    scenes: SceneStore, test: TestSequence, context: Context, first: int
+    scenes: SceneStore, test: TestSequence, recoverer: Recoverer, state: State, first: int
 ) -> tuple[TestSequence, dict[str, Prediction]]:
-    """Frames of `registered` with the camera's frames at times between windows, from window `first` on; their truth."""
-    frames = camera_frames(scenes, test.name, int(test.t_us[-1]), BETWEEN_FRAMES_HZ)
-    recoverer = METHODS[WHOLE].open(replace(context.setups[METHODS[WHOLE].section], frames=frames))
+    """Maps at times between windows, from window `first` on, of the run that ended in `state`; with their truth."""
     windows = test.windows_for(False)
-    state, _ = recoverer.step(recoverer.start(*test.dolp.shape[-2:]), windows)
     t_us = np.arange(windows[first].start_us, windows[-1].stop_us, BETWEEN_US) // (10**6 // BETWEEN_HZ)
     t_us = t_us[1:] * (10**6 // BETWEEN_HZ)
     truth = sequence_at(scenes, test.name, test.events, torch.from_numpy(np.concatenate([[0], t_us])))

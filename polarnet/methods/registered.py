@@ -77,13 +77,15 @@ class Block(NamedTuple):
     frames: StokesFrames | None
     """Frames of the camera within these windows; None if there are none."""
     shown: Float32[np.ndarray, "5 H W"] | None
-    """What they show along the motion (`_shown`)."""
+    """Images of these along the motion (`_shown`)."""
 
     def at(self, t_us: Int64[np.ndarray, " n"]) -> Prediction:
-        """Maps at times within these windows. With s the joined (s1, s2), DoLP^2 is |s|^2 plus the variance of the
-        network's own (s1, s2) along the motion: the network's DoLP is its expectation, so its average vectors are
-        shorter than that. With frames, s is their mean along the motion where they show the scene. Where the panorama
-        does not explain the events, the network's maps stay, or the frame nearest in time takes their place.
+        """Maps at times within these windows.
+
+        With s the joined (s1, s2), DoLP^2 is |s|^2 plus the variance of the network's own (s1, s2) along the motion.
+        The network's DoLP is its expectation, so its average vectors are shorter than that. With frames, s is their
+        mean along the motion where they show the scene. Where the panorama does not explain the events, the network's
+        maps stay, or the frame nearest in time takes their place.
         """
         x, y = (np.interp(t_us, self.edges_us, place) for place in (self.x, self.y))
         own = self._network_at(t_us, x, y)

@@ -46,7 +46,7 @@ def test_the_filter_with_frames_starts_at_a_frame_and_forgets_its_events_until_i
     stokes = torch.zeros(1, 2, 2, 2)
     stokes[:, 0] = 0.4
     frames = StokesFrames(np.array([5_000]), stokes, torch.ones(1, 2, 2, dtype=torch.bool))
-    found = filtered_with(frames, test, settings().methods.cf).dolp
+    found = filtered_with(frames, test, settings()).dolp
     assert found[0, 1, 1] == pytest.approx(0.4, abs=1e-6)
     rise = math.exp(0.2 * math.exp(-2 * math.pi * FILTER_HZ * 0.01))  # of one event, 10 ms later
     assert found[0, 0, 0] == pytest.approx((0.7 * rise - 0.3) / (0.7 * rise + 0.3), abs=1e-4)
