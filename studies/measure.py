@@ -41,7 +41,7 @@ STUDIES = {
     "measured " + LARGE,
     ("robustness", "layers_test"): "studies.robustness --layers " + LARGE,
     ("robustness", "speed"): "studies.speed --only network --write",
-    ("registration", "bounds"): f"studies.registration --work {{work}}/registration {SETS} --write",
+    ("robustness", "bounds"): f"studies.registration --work {{work}}/registration {SETS} --write",
     ("emulation", "models"): "studies.speed --only simulation --write",
     ("speed", "live"): "studies.speed --only live --write",
     ("recordings", "readers"): "studies.recordings --sections readers --write",

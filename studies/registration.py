@@ -21,7 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Float64
+from torch import Tensor
 
 from polarnet.benchmark.rows import predictions_of
 from polarnet.benchmark.sequences import TestSequence
@@ -29,14 +31,16 @@ from polarnet.config.pipeline import context_of
 from polarnet.events.representations import event_counts
 from polarnet.events.streaming import encode_windows
 from polarnet.methods.registration import Panorama, register, views
+from polarnet.metrics.offset import contrasts, dolp_of, offset_scores
+from polarnet.metrics.similarity import mse, spread_mse
 from polarnet.networks.weights import shipped_weights
+from polarnet.stokes import Prediction
 from studies.robustness import OURS, conditions_of, simulated, warmup_windows
 from studies.scored_pictures import ingested, scenes_of, settings
 from studies.study import arguments_of, command_line, machine_record, write_section
 
 THRESHOLD = 0.2  # change of natural-log intensity per event
 LINE = 4  # pixels, width of a line along the motion
-MAX_S = 0.98
 
 
 def redundant_offset(panorama: Panorama) -> Float64[np.ndarray, " 2"]:
@@ -53,7 +57,7 @@ def redundant_offset(panorama: Panorama) -> Float64[np.ndarray, " 2"]:
     return (constants[:2] - constants[2:]) / 2
 
 
-def contrasts(panorama: Panorama, size: tuple[int, int], first: int) -> Float32[np.ndarray, "2 k h w"]:
+def panorama_contrasts(panorama: Panorama, size: tuple[int, int], first: int) -> Float32[np.ndarray, "2 k h w"]:
     """atanh(s1) and atanh(s2) at each time from the first scored one on, up to an offset each."""
     images = THRESHOLD * (panorama.images - panorama.images[:, panorama.seen].mean(1)[:, None, None])
     x, y = panorama.x[first:], panorama.y[first:]
@@ -76,48 +80,37 @@ def offset_of_lines(
     return medians[:, line]
 
 
-def _contrasts_of(dolp: np.ndarray, aolp: np.ndarray) -> np.ndarray:
-    """atanh(s1) and atanh(s2)."""
-    return np.arctanh(MAX_S * dolp * np.stack([np.cos(2 * aolp), np.sin(2 * aolp)]))
-
-
 def errors_of(test: TestSequence, first: int) -> dict[str, float]:
     """Mean squared errors of DoLP by row, that of each frame's own mean, and the mean squared offset of ours."""
     size = (test.dolp.shape[-2], test.dolp.shape[-1])
-    true_dolp, true_aolp = (field[first:].double().numpy() for field in (test.dolp, test.aolp))
-    valid = np.ones_like(true_dolp, bool) if test.valid is None else test.valid[first:].numpy()
-    truth = _contrasts_of(true_dolp, true_aolp)
+    true_dolp, true_aolp = test.dolp[first:], test.aolp[first:]
+    valid = torch.ones_like(true_dolp, dtype=torch.bool) if test.valid is None else test.valid[first:]
+    truth = contrasts(true_dolp, true_aolp).double().numpy().swapaxes(0, 1)
     config = settings()
     ours = predictions_of([OURS], test, context_of(config, [OURS], 0.0, shipped_weights()))[OURS]
-    assert ours.aolp is not None
-    own = _contrasts_of(ours.dolp[first:].double().clamp(0, 1).numpy(), ours.aolp[first:].double().numpy())
-    moves = np.array(
-        [[np.median((t - o)[v]) for t, o, v in zip(*pair, valid, strict=True)] for pair in zip(truth, own, strict=True)]
-    )
+    ours = Prediction(ours.dolp[first:], None if ours.aolp is None else ours.aolp[first:])
+    of_ours = offset_scores(ours, true_dolp, true_aolp, valid)
     counts = encode_windows(test.events, test.t_us, event_counts).numpy()
     polarity, number = counts[:, 0::2].transpose(1, 0, 2, 3), counts[:, 1::2].transpose(1, 0, 2, 3)
     panorama = register(np.stack([number + polarity, number - polarity], axis=1) / 2, config.methods.registration)
     assert panorama is not None, "the test scenes move"
-    found = contrasts(panorama, size, first + 1)
-    true_offset = np.array([np.median((t - o)[valid]) for t, o in zip(truth, found, strict=True)])
+    found, seen = panorama_contrasts(panorama, size, first + 1), valid.numpy()
+    true_offset = np.array([np.median((t - o)[seen]) for t, o in zip(truth, found, strict=True)])
 
-    def mean_error(dolp: np.ndarray) -> float:
-        return float(
-            np.mean([np.square(d - t)[v].mean() for d, t, v in zip(dolp, true_dolp, valid, strict=True) if v.any()])
-        )
+    def mean_error(frames: Tensor) -> float:
+        return float(mse(frames.clamp(0, 1), true_dolp, valid).mean())
 
-    def mse(contrast: np.ndarray) -> float:
-        return mean_error(np.hypot(*np.tanh(contrast)).clip(0, 1))
+    def error(contrast: np.ndarray) -> float:
+        return mean_error(dolp_of(torch.from_numpy(contrast.swapaxes(0, 1))).float())
 
-    means = np.array([t[v].mean() if v.any() else 0.0 for t, v in zip(true_dolp, valid, strict=True)])
     return {
-        "oracle_mean": mean_error(np.broadcast_to(means[:, None, None], true_dolp.shape)),
-        "ours": mean_error(ours.dolp[first:].clamp(0, 1).numpy()),
-        "ours, true offset": mse(own + moves[..., None, None]),
-        "panorama, true offset": mse(found + true_offset[:, None, None, None]),
-        "panorama, true offset of lines": mse(found + offset_of_lines(panorama, truth - found, valid, first + 1)),
-        "panorama, solved": mse(found + redundant_offset(panorama)[:, None, None, None]),
-        "offset": float(np.square(moves).mean()),
+        "oracle_mean": float(spread_mse(true_dolp, valid).mean()),
+        "ours": mean_error(ours.dolp),
+        "ours, true offset": float(of_ours["no_offset_mse"].mean()),
+        "panorama, true offset": error(found + true_offset[:, None, None, None]),
+        "panorama, true offset of lines": error(found + offset_of_lines(panorama, truth - found, seen, first + 1)),
+        "panorama, solved": error(found + redundant_offset(panorama)[:, None, None, None]),
+        "offset": float(of_ours["offset"].mean()),
     }
 
 
@@ -138,7 +131,7 @@ def table_of(errors: dict[str, dict[str, float]]) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, print and perhaps write."""
-    parser = command_line(__doc__, "section bounds of docs/results/registration.json")
+    parser = command_line(__doc__, "section bounds of docs/results/robustness.json")
     parser.add_argument("--photographs", type=Path, required=True)
     parser.add_argument("--measured", type=Path, nargs="+", default=[])
     parser.add_argument("--work", type=Path, required=True)
@@ -162,7 +155,7 @@ def main() -> None:
     for part, table in tables.items():
         print(part, table, flush=True)
     if arguments.write:
-        write_section("registration", "bounds", {"split": arguments.split, "limit": arguments.limit, **tables}, record)
+        write_section("robustness", "bounds", {"split": arguments.split, "limit": arguments.limit, **tables}, record)
 
 
 if __name__ == "__main__":

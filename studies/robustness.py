@@ -70,6 +70,7 @@ CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
+OFFSET = ("offset", "no_offset_mse")  # of atanh(s1) and atanh(s2) in a frame, and the MSE of DoLP without it
 FRAMES_HZ = (1, 5, 20)  # of the camera
 BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`recover --step`), and of the camera's
 BETWEEN_US = 12_500  # time between those that are scored, every 25th
@@ -300,7 +301,7 @@ def warmup_windows(config: Config) -> int:
 
 def table_of(scores: Scores) -> dict[str, Any]:
     """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
-    errors, psnr = (scene_means(scores.rows, metric) for metric in ("mse", "psnr"))
+    errors, psnr, offsets, left = (scene_means(scores.rows, name) for name in ("mse", "psnr", *OFFSET))
     oracle = errors["oracle_mean"]
     table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
     for row, of_scene in errors.items():
@@ -311,6 +312,10 @@ def table_of(scores: Scores) -> dict[str, Any]:
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
             "psnr": statistics.fmean(psnr[row].values()),
         }
+        if row in offsets:
+            table["rows"][row] |= {
+                name: statistics.fmean(of[row].values()) for name, of in zip(OFFSET, (offsets, left), strict=True)
+            }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
     return table
@@ -425,8 +430,13 @@ def main() -> None:
     elif mode == LAYERS:
         rows = {name: table["rows"] for name, table in tables.items()}
         figures = {LAYERS: {name: of[WHOLE]["mse"] / of[OURS]["mse"] for name, of in rows.items()}}
+    elif mode == WHOLE_FILE:
+        figures = {mode: headlines(tables, WHOLE)}
+        if "measured" in tables:
+            rows = tables["measured"]["rows"]
+            figures["measured"] = {"offset_over_before": rows[WHOLE]["offset"] / rows[OURS]["offset"]}
     else:
-        figures = {mode: headlines(tables, WHOLE)} if mode else headlines(tables, next(iter(arguments.weights)))
+        figures = headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))
     weights = {row: sha256(file) for row, file in arguments.weights.items()}
     section = {"limit": arguments.limit, "sensor_limit": arguments.sensor_limit, "weights": weights, "tables": tables}

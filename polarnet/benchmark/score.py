@@ -14,6 +14,7 @@ from torch import Tensor
 from polarnet.benchmark.sequences import TestSequence
 from polarnet.methods import ROWS
 from polarnet.metrics.lpips import BACKBONES, Lpips
+from polarnet.metrics.offset import offset_scores
 from polarnet.metrics.similarity import (
     MIN_MSE,
     frame_scores,
@@ -27,7 +28,10 @@ from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
-METRICS = ("mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "aolp_deg", "skill")
+METRICS = (
+    "mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "offset", "no_offset_mse", "aolp_deg",
+    "skill",
+)  # fmt: skip
 SETS = ("simulated", "measured")
 """Test sets: the pipeline's held-out sequences, the same pictures under harder motion, measured polarization."""
 
@@ -81,6 +85,9 @@ class FrameScore(NamedTuple):
     """`similarity.gradient_agreement`."""
     level_mse: float
     pattern_mse: float
+    offset: float | None
+    """`offset.offset_scores`; this and the next are None if the method predicts no angle."""
+    no_offset_mse: float | None
     aolp_deg: float | None
     """`similarity.aolp_error_deg`, weighted by the true DoLP; None if the method predicts no angle."""
     oracle_mse: float
@@ -144,6 +151,7 @@ def score_sequence(
             "grad": gradient_agreement(prediction.dolp, truth, valid),
             "level_mse": level_mse(prediction.dolp, truth, valid),
             "pattern_mse": pattern_mse(prediction.dolp, truth, valid),
+            **offset_scores(prediction, truth, aolp, valid),
             "oracle_mse": spread_mse(truth, valid),
         }
         columns = [scores[name].tolist() if name in scores else [None] * len(windows) for name in SCORES]

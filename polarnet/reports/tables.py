@@ -45,10 +45,13 @@ COLUMNS: Mapping[str, Column] = {
 PARTS_AND_COSTS = {
     "level_mse": Column("level", 4, "low"),
     "pattern_mse": Column("pattern", 4, "low"),
+    "offset": Column("offset", 3, "low"),
+    "no_offset_mse": Column("without offset", 4, "low"),
     "gflop": Column("GFLOP / window", 2, "low", False),
     "params": Column("parameters", 0, "low", False),
 }
-"""Parts of the MSE (level, the squared error of the frame's mean, and pattern, the remainder), and costs."""
+"""Parts of the MSE (level, the squared error of the frame's mean, and pattern, the remainder), the mean squared offset
+of atanh(s1) and atanh(s2) and the MSE without it, and costs."""
 
 SET_TITLES = {
     "simulated": "Simulated",

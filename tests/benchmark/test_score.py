@@ -14,6 +14,7 @@ from polarnet.benchmark.score import (
     summary,
 )
 from polarnet.metrics.lpips import Lpips
+from polarnet.metrics.offset import contrasts, dolp_of
 from polarnet.stokes import Prediction
 
 CPU = torch.device("cpu")
@@ -44,6 +45,20 @@ def test_a_constant_offset_scores_its_square_as_level_in_windows_after_the_warm_
     spoilt[:2] = float("nan")  # windows of the warm-up count for no method
     rows = score_sequence(sequence, {"a": Prediction(spoilt), "b": Prediction(sequence.dolp)}, 2, None, CPU)
     assert [(r.method, r.window) for r in rows] == [("a", 2), ("a", 3), ("b", 2), ("b", 3)]
+
+
+def test_an_offset_of_s1_and_s2_is_scored_apart_from_the_rest(sequence):
+    truth = dataclasses.replace(sequence, dolp=0.5 * sequence.dolp)
+    moved = contrasts(truth.dolp, truth.aolp) + torch.tensor([0.3, -0.1])[:, None, None]
+    s1, s2 = torch.tanh(moved).unbind(1)
+    prediction = Prediction(dolp_of(moved), torch.atan2(s2, s1) / 2)
+    valid = torch.rand(truth.dolp.shape, generator=torch.Generator().manual_seed(0)) < 0.8
+    masked = dataclasses.replace(truth, valid=valid)
+    rows = score_sequence(masked, {"moved": prediction, "plain": Prediction(prediction.dolp)}, 1, None, CPU)
+    for r in rows[:3]:
+        assert r.offset == pytest.approx((0.3**2 + 0.1**2) / 2, rel=1e-3)
+        assert r.no_offset_mse < 1e-6 < 1e-3 < r.mse
+    assert [(r.offset, r.no_offset_mse) for r in rows[3:]] == [(None, None)] * 3
 
 
 def test_frames_that_cannot_be_scored_are_refused(sequence):
