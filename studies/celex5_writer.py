@@ -1,4 +1,4 @@
-"""Write BIN and CSV files of a CeleX-5, for simulated cameras and for tests of the readers."""
+"""Write BIN files of a CeleX-5, for simulated cameras and for tests of the readers."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,12 +24,10 @@ from polarnet.recordings.formats.celex5 import (
     WIDTH,
     microseconds,
 )
-from polarnet.recordings.formats.lines import lines_of
 from polarnet.runtime.compilation import compiled
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
-CSV_LINES = 2**18  # written at a time
 STEP = 2**15  # time stamps from one row to the next, at most
 
 
@@ -41,7 +39,8 @@ def write_celex5_bin(path: Path, events: Events) -> Events:
     ValueError for events that are out of order, before 0, off a sensor of 800 x 1280, or more than 4095 of one polarity
     in a row in a pixel.
     """
-    _check_size(events)
+    if events.height > HEIGHT or events.width > WIDTH:
+        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
     validate(events)
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
@@ -75,25 +74,6 @@ def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800
                 )
             file.write(LENGTH.pack(PICTURE_BYTES) + _packed_picture(picture).tobytes() + b"\0")
             file.write(STAMP.pack(t // 1000, 0))
-
-
-def write_celex5_csv(path: Path, events: Events) -> None:
-    """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
-
-    The intensity is half of the maximum. ValueError where events are not on the sensor of 800 x 1280.
-    """
-    _check_size(events)
-    adc = np.full(len(events), WHITE // 2)
-    columns = [events.y.numpy(), events.x.numpy(), adc, events.p.numpy(), events.t.numpy()]
-    with path.open("wb") as file:
-        for start in range(0, len(events), CSV_LINES):
-            part = [column[start : start + CSV_LINES] for column in columns]
-            file.write(lines_of(np.stack(part, axis=1).astype(np.int64), ","))
-
-
-def _check_size(events: Events) -> None:
-    if events.height > HEIGHT or events.width > WIDTH:
-        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
 
 
 def _header(mode: int, data_type: int, packages: int) -> bytes:

@@ -11,12 +11,12 @@ from jaxtyping import Float, Int64, UInt8
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, slice_count
 from polarnet.networks.e2p.network import MOSAIC
-from polarnet.recordings.formats.aedat3 import PACKET
+from polarnet.recordings.formats import aedat3, celex5
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
-from studies.celex5_writer import write_celex5_bin, write_celex5_csv
-from studies.rosbag_writer import array_bytes, write_arrays, write_packets
+from studies.celex5_writer import write_celex5_bin
+from studies.rosbag_writer import ARRAY, PACKET, array_bytes, packet_bytes, write_bag
 
 PACKET_EVENTS = 10_000
 TEXT_LINES = 1_000_000  # formatted at a time
@@ -65,7 +65,7 @@ def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
 def aedat3_packet(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
     """A packet of AEDAT 3.1."""
     entries = np.stack([x << 17 | y << 2 | p << 1 | 1, t], axis=1).astype("<u4")
-    return PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
+    return aedat3.PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
 
 
 def write_aedat2(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], frames: UInt8[np.ndarray, "n h w"]) -> None:
@@ -160,14 +160,14 @@ def with_faery(path: Path, events: Events) -> None:
     faery.events_stream_from_array(rows, (events.width, events.height)).to_file(path)
 
 
-def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Writer:
+def messages(content_of: Callable[..., bytes], kind: str, plugin: str | None) -> Writer:
     """A writer of a bag with a message for every `PACKET_EVENTS` events."""
 
-    def write_bag(path: Path, events: Events) -> None:
+    def write(path: Path, events: Events) -> None:
         contents = itertools.starmap(content_of, parts_of(events, PACKET_EVENTS))
-        write(path, events.height, events.width, contents)
+        write_bag(path, events.height, events.width, contents, kind=kind, plugin=plugin)
 
-    return write_bag
+    return write
 
 
 PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
@@ -175,8 +175,8 @@ AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADE
 FILES: dict[str, tuple[str, Writer]] = {
     **{name: (".h5", table_writer(name)) for name in LAYOUTS},
     "dsec of polarnet": (".h5", write_hdf5),
-    "rosbag": (".bag", messages(write_arrays, array_bytes)),
-    "rosbag of EventPacket": ("", messages(write_packets, lambda *columns: ("evt3", 0, evt3(*columns)))),
+    "rosbag": (".bag", messages(array_bytes, ARRAY, None)),
+    "rosbag of EventPacket": ("", messages(lambda *columns: packet_bytes("evt3", 0, evt3(*columns)), PACKET, "MCAP")),
     "aedat4": (".aedat4", with_faery),
     "aedat3": (".aedat", binary(AEDAT3, aedat3_packet, PACKET_EVENTS)),
     "aedat2": (".aedat", lambda path, events: write_aedat2(path, events, NO_TIMES, NO_FRAMES)),
@@ -206,7 +206,10 @@ FILES: dict[str, tuple[str, Writer]] = {
         ".csv",
         binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
     ),
-    "celex5_csv": (".csv", write_celex5_csv),
+    "celex5_csv": (
+        ".csv",
+        binary("", lambda t, x, y, p: lines_of(np.stack([y, x, 0 * t + celex5.WHITE // 2, 2 * p - 1, t], axis=1), ",")),
+    ),
     "celex5_bin": (".bin", write_celex5_bin),
 }
 """Suffix and writer of each format, and of further kinds of files whose first word is the format."""
