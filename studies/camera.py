@@ -4,9 +4,11 @@ The test of each defect that an audit found is run, and a DoFP sensor is calibra
 the figures into docs/results/camera.json.
 """
 
+import argparse
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +26,7 @@ from polarnet.simulation.pixels.light import FULL_SCALE, KNEE
 from polarnet.simulation.presets import POLARIZERS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from studies.pictures import QUIET
-from studies.study import ROOT, arguments_of, command_line, machine_record, outcomes, write_section
+from studies.study import ROOT, command_line, measure_sections, outcomes
 
 SIZE = (12, 16)  # rows and columns of the calibrated sensor
 STEP = 0.01  # contrast thresholds of its pixels, natural-log intensity
@@ -105,17 +107,16 @@ def analyzer_errors(sensor: EmulatorConfig, seed: int = 1) -> Float64[Tensor, "4
     return (calibrated_analyzers(camera, seed) - true) / true[:, :1]
 
 
-def main() -> None:
-    """Measure, print, and with --write keep the figures."""
-    write = arguments_of(command_line(__doc__, "docs/results/camera.json")).write
-    record, cases = machine_record(), outcomes(*(f"tests/{test}" for test in DEFECTS))
+def measure(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Defects whose tests pass; their number, that of presets of real cameras, and errors of calibrated analyzers."""
+    cases = outcomes(*(f"tests/{test}" for test in DEFECTS))
     mended = {
         test: min(one["passed"] for case, one in cases.items() if case.partition("[")[0] == test.partition("::")[2])
         for test in DEFECTS
     }
     exact, noisy = (analyzer_errors(sensor) for sensor in (FINE, SENSORS["default"]))
     cameras = [path for path in (ROOT / "conf" / "sensor").glob("*.yaml") if path.stem not in FROM_V2E]
-    totals = {
+    return mended, {
         "defects_mended": sum(mended.values()),
         "sensor_presets": len(cameras),
         "analyzer_error_max": round(float(exact.abs().max()), 5),
@@ -124,10 +125,7 @@ def main() -> None:
             "rms": round(float(noisy.square().mean().sqrt()), 4),
         },
     }
-    print(mended, totals)
-    if write:
-        write_section("camera", "defects", mended, record, totals)
 
 
 if __name__ == "__main__":
-    main()
+    measure_sections(command_line(__doc__, "docs/results/camera.json"), {"defects": ("camera", "defects", measure)})

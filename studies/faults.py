@@ -11,12 +11,13 @@
 --only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
 
+import argparse
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import io
 import itertools
-import json
 import multiprocessing
 import os
 import shutil
@@ -46,7 +47,7 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import read_history
 from studies.pairs import pairs
-from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
+from studies.study import ROOT, command_line, measure_sections, read_results
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
 MAX_RENAMES = 51  # of `write_store` on an old store
@@ -334,24 +335,22 @@ def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
 def main() -> None:
     """The command line."""
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--only", choices=SECTIONS, help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=100, help="of stores")
     parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
-    arguments = arguments_of(parser)
-    studies: dict[str, Callable[[], Mapping[str, Any]]] = {
-        "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
-        "kills": lambda: kills(arguments.kills),
-        "names": hostile_names,
-        "pairs": lambda: pairs(arguments.runs[0], arguments.pairs),
+    studies: dict[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
+        "artefacts": lambda given: inject(given.runs, given.faults, seed=1)[0],
+        "kills": lambda given: kills(given.kills),
+        "names": lambda _: hostile_names(),
+        "pairs": lambda given: pairs(given.runs[0], given.pairs),
     }
-    for name in [arguments.only] if arguments.only else studies:
-        record, figures = machine_record(), studies[name]()
-        print(name, json.dumps(figures, indent=2))
-        if arguments.write:
-            known = {**read_results("reliability"), name: figures}
-            write_section("reliability", name, figures, record, headlines(known))
+
+    def counted(name: str, given: argparse.Namespace) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+        counts = studies[name](given)
+        return counts, headlines({**read_results("reliability"), name: counts})
+
+    measure_sections(parser, {name: ("reliability", name, functools.partial(counted, name)) for name in studies})
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ and response. DoLP: the shipped network sees generated scenes (dead leaves) that
 with v2e's response and with dark currents of 0, 5 and 20 DN. `--write` puts the figures into docs/results/light.json.
 """
 
-import json
+import argparse
 import math
 from dataclasses import replace
 from typing import Any
@@ -21,7 +21,7 @@ from polarnet.simulation.presets import MOTIONS, SENSORS
 from polarnet.simulation.scene import PolarizationScene, scene_from_rgb
 from polarnet.simulation.sequence import simulate
 from studies.pictures import QUIET
-from studies.study import arguments_of, command_line, machine_record, write_section
+from studies.study import command_line, measure_sections
 
 RESPONSES: dict[str, dict[str, Any]] = {
     "exact, v2e's response": {"model": "exact"},
@@ -63,17 +63,19 @@ def dolp_error(dark_dn: float | None, dimmed: float) -> float:
     return round(float(np.mean(errors)), 5)
 
 
-def main() -> None:
-    """The command line."""
-    write, record = arguments_of(command_line(__doc__, "docs/results/light.json")).write, machine_record()
-    tune()
+def measure_events(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Events a second by pixel model and response, and levels of light."""
     events = {label: events_by_light(replace(QUIET, **changes)) for label, changes in RESPONSES.items()}
-    dolp = {str(dark): {str(dimmed): dolp_error(dark, dimmed) for dimmed in DIMMED} for dark in DARK_DN}
-    print(json.dumps({"events": events, "dolp": dolp}, indent=1))
-    if write:
-        write_section("light", "events", {"levels_dn": LEVELS_DN.tolist(), "per_second": events}, record)
-        write_section("light", "dolp", {"scenes": SCENES, "mse": dolp}, record)
+    return {"levels_dn": LEVELS_DN.tolist(), "per_second": events}, {}
+
+
+def measure_dolp(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """DoLP error by dark current and light."""
+    tune()
+    mse = {str(dark): {str(dimmed): dolp_error(dark, dimmed) for dimmed in DIMMED} for dark in DARK_DN}
+    return {"scenes": SCENES, "mse": mse}, {}
 
 
 if __name__ == "__main__":
-    main()
+    sections = {"events": ("light", "events", measure_events), "dolp": ("light", "dolp", measure_dolp)}
+    measure_sections(command_line(__doc__, "docs/results/light.json"), sections)

@@ -6,6 +6,7 @@ FOLDER gets pdavis_ANGLE.aedat, .aedat4 and .h5, each with events and frames. Ao
 file, and AoLP of its frames, are compared with the polarizer's. --write: docs/results/recordings.json, section pdavis.
 """
 
+import argparse
 import math
 from datetime import timedelta
 from pathlib import Path
@@ -28,7 +29,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, stoke
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import APPENDED, open_truth
 from studies.recording_files import EXPOSURE_US, WHITE, mosaicked, write_aedat2, write_e2p
-from studies.study import arguments_of, command_line, machine_record, write_section
+from studies.study import command_line, measure_sections
 
 MOSAIC_TEXT = "90 45 / 135 0"
 POLARIZERS_DEG, TRUE_DOLP = (0, 30, 90), 0.8
@@ -117,20 +118,14 @@ def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """The command line."""
-    parser = command_line(__doc__, "docs/results/recordings.json")
-    parser.add_argument("folder", type=Path, help="folder for the files")
-    arguments = arguments_of(parser)
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    record, rows = machine_record(), []
-    for polarizer_deg in POLARIZERS_DEG:
-        for recording in write_recordings(simulate(arguments.folder, polarizer_deg), arguments.folder, polarizer_deg):
-            rows.append(score(recording, polarizer_deg))
-            print(rows[-1], flush=True)
-    if arguments.write:
-        write_section("recordings", "pdavis", {"files": rows}, record)
+def measure(given: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Errors of each file."""
+    given.folder.mkdir(parents=True, exist_ok=True)
+    angles = [(write_recordings(simulate(given.folder, deg), given.folder, deg), deg) for deg in POLARIZERS_DEG]
+    return {"files": [score(recording, deg) for recordings, deg in angles for recording in recordings]}, {}
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser.add_argument("folder", type=Path, help="folder for the files")
+    measure_sections(parser, {"pdavis": ("recordings", "pdavis", measure)})

@@ -1,7 +1,7 @@
 """Draw the pictures of docs: python -m studies.pictures [FOLDER]
 
 Every line, event and picture in them comes from the simulation, the shipped weights and the demo; where a formula is
-drawn, its label says so. `studies.rig` draws those of the pages on recordings.
+drawn, its label says so. `studies.simulated_rig` draws those of the pages on recordings.
 """
 
 import argparse

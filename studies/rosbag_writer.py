@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def write_bag(
     for name, text in DEFINITIONS.items():
         text = text.format(time="builtin_interfaces/Time" if plugin else "time")
         store.register(get_types_from_msg(text, kind.rpartition("/")[0] + f"/{name}"))
-    ros2 = {"version": 9, "storage_plugin": rosbag2.StoragePlugin[plugin]} if plugin else {}
+    ros2: dict[str, Any] = {"version": 9, "storage_plugin": rosbag2.StoragePlugin[plugin]} if plugin else {}
     with rosbag2.Writer(path, **ros2) if plugin else rosbag1.Writer(path) as bag:
         connections = [bag.add_connection(topic, kind, typestore=store) for topic in topics]
         for k, content in enumerate(contents):
