@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
+from omegaconf import OmegaConf
 
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.files import files_of, sha256
@@ -85,12 +85,7 @@ def prepare(run_folder: Path, scratch: Path) -> None:
     shutil.copytree(run_folder, scratch, ignore=shutil.ignore_patterns(".git", "cache", "tmp"), symlinks=True)
     os.chdir(scratch)
     Path(".dvc", "config.local").write_text("[core]\n    no_scm = true\n    analytics = false\n")
-    yaml = YAML()
-    params = yaml.load(Path("params.yaml"))
-    for section, values in TINY.items():
-        for key, value in values.items():
-            params[section][key] = {**params[section][key], **value} if isinstance(value, dict) else value
-    yaml.dump(params, Path("params.yaml"))
+    OmegaConf.save(OmegaConf.merge(OmegaConf.load("params.yaml"), TINY), "params.yaml")
     config = Path("conf", "config.yaml")
     config.write_text(config.read_text().replace("threads: 0", "threads: 1"))
     first, *_, last = EventStore.open(STORE).sequences
