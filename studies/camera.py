@@ -18,7 +18,7 @@ from torch import Tensor
 from polarnet.clips.video import simulate_video
 from polarnet.config.tree import load
 from polarnet.events.rotation import Rotation
-from polarnet.events.stream import Events, select
+from polarnet.events.stream import select
 from polarnet.methods.rotating_polarizer import fit_half_turn
 from polarnet.simulation.camera import Camera, pixel_analyzers
 from polarnet.simulation.emulator import EmulatorConfig
@@ -65,7 +65,8 @@ def calibrated_analyzers(camera: Camera, seed: int) -> Float64[Tensor, "4 3 h w"
     events gives its thresholds; below, where the response is proportional to light, its a0. Then the lamp's
     polarization turns: `fit_half_turn` gives (a1, a2) / a0.
     """
-    rate_hz, base = 0.5e6 / HALF_TURN_US, load(ROOT).methods.rotating_polarizer
+    rate_hz = 0.5e6 / HALF_TURN_US
+    base = replace(load(ROOT).methods.rotating_polarizer, cutoff_hz=camera.sensor.cutoff_hz, ridge=1e-9)
     t_us = np.linspace(0, 2 * HALF_TURN_US, 2 * FRAMES + 1).round().astype(int).tolist()
     swelling = [lamp(min(k, 2 * FRAMES - k) / FRAMES, 0.0, 0.0) for k in range(2 * FRAMES + 1)]
     turning = [lamp(1.0, LAMP_DOLP, math.pi * t / HALF_TURN_US) for t in t_us[: FRAMES + 1]]
@@ -73,8 +74,9 @@ def calibrated_analyzers(camera: Camera, seed: int) -> Float64[Tensor, "4 3 h w"
     swollen = simulate_video(swelling, t_us, camera, seed).events
     turned = simulate_video(turning, t_us[: FRAMES + 1], camera, seed).events
     analyzers = torch.zeros(len(turned), 3, SIZE[0] // 2, SIZE[1] // 2, dtype=torch.float64)
-    for channel, place in itertools.product(range(len(turned)), np.ndindex(SIZE[0] // 2, SIZE[1] // 2)):
-        lit, turns = (of_pixel(events[channel], *place) for events in (swollen, turned))
+    for channel, (row, column) in itertools.product(range(len(turned)), np.ndindex(SIZE[0] // 2, SIZE[1] // 2)):
+        of_channel = swollen[channel], turned[channel]
+        lit, turns = (select(events, (events.y == row) & (events.x == column)) for events in of_channel)
         t, rises = lit.t.numpy(), lit.p.numpy() > 0
         shares = 1 - np.abs(t / HALF_TURN_US - 1)  # of the lamp's light
         on, off = (
@@ -84,20 +86,12 @@ def calibrated_analyzers(camera: Camera, seed: int) -> Float64[Tensor, "4 3 h w"
         dim = shares[rises][: int(LINEAR_RESPONSE / on)]
         a0 = on * (len(dim) - 1) / (dim[-1] - dim[0]) * KNEE / math.log(KNEE) / FULL_SCALE
         assert a0 * ABOVE_KNEE * FULL_SCALE > KNEE
-        config = replace(
-            base, threshold_on=on, threshold_off=off, cutoff_hz=camera.sensor.cutoff_hz, level_dn=a0 * FULL_SCALE,
-            ridge=1e-9,
-        )  # fmt: skip
-        degree, angle, _ = (one[place].item() for one in fit_half_turn(turns, rotation, HALF_TURN_US, config))
+        config = replace(base, threshold_on=on, threshold_off=off, level_dn=a0 * FULL_SCALE)
+        degree, angle, _ = (one[row, column].item() for one in fit_half_turn(turns, rotation, HALF_TURN_US, config))
         polarized = a0 * degree / LAMP_DOLP
         analyzer = [a0, polarized * math.cos(2 * angle), polarized * math.sin(2 * angle)]
-        analyzers[channel, :, *place] = torch.tensor(analyzer)
+        analyzers[channel, :, row, column] = torch.tensor(analyzer)
     return analyzers
-
-
-def of_pixel(events: Events, row: int, column: int) -> Events:
-    """The events of one pixel."""
-    return select(events, (events.y == row) & (events.x == column))
 
 
 def analyzer_errors(sensor: EmulatorConfig, seed: int = 1) -> Float64[Tensor, "4 3 h w"]:

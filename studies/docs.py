@@ -9,9 +9,9 @@ import json
 import operator
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from string import Template
+from string import Formatter, Template
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
@@ -25,38 +25,30 @@ ROOT_OF = "rms"
 Results = Mapping[str, Any]
 
 
-class Value:
-    """A value as a format string prints it: "-" if missing; lists and mappings are joined by commas; RMS of an MSE."""
+class Cells(Formatter):
+    """Format strings over results: "-" for a missing value; lists and mappings joined by commas; RMS of an MSE."""
 
-    def __init__(self, value: Any):
-        self.value = value
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> tuple[Any, str]:
+        """The value at a path such as test[rows][ours], or None if there is none, and the path."""
+        value: Any = kwargs
+        for key in re.findall(r"[^\[\]]+", field_name):
+            if isinstance(value, list):
+                value = value[int(key)]
+            else:
+                value = value.get(key) if isinstance(value, Mapping) else None
+        return value, field_name
 
-    def __getitem__(self, key: str | int) -> "Value":
-        if isinstance(self.value, list):
-            return Value(self.value[int(key)])
-        return Value(self.value.get(key) if isinstance(self.value, Mapping) else None)
-
-    def __format__(self, form: str) -> str:
-        value = self.value
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Text of a value."""
         if isinstance(value, Mapping):
-            return ", ".join(f"`{key}: {Value(one)}`" for key, one in value.items())
+            return ", ".join(f"`{key}: {self.format_field(one, '')}`" for key, one in value.items())
         if isinstance(value, list):
-            return ", ".join(format(Value(one), form) for one in value)
+            return ", ".join(self.format_field(one, format_spec) for one in value)
         if value is None:
             return "-"
-        if form.startswith(ROOT_OF):
-            return format(value**0.5, form.removeprefix(ROOT_OF))
-        return str(value).lower() if isinstance(value, bool) else format(value, form)
-
-    def __str__(self) -> str:
-        return format(self)
-
-
-class Values(dict[str, Any]):
-    """Values by name for `str.format_map`; a name that is not there is a missing value."""
-
-    def __getitem__(self, key: str) -> Value:
-        return Value(self.get(key))
+        if format_spec.startswith(ROOT_OF):
+            return format(value**0.5, format_spec.removeprefix(ROOT_OF))
+        return str(value).lower() if isinstance(value, bool) else format(value, format_spec)
 
 
 class Table(NamedTuple):
@@ -118,7 +110,7 @@ def block_text(table: Table, results: Results) -> str:
         return "Not measured yet."
     record = results.get("records", {}).get(table.section) or results
     origin = f"Commit `{record['commit'][:10]}`." if "commit" in record else ""
-    caption = table.caption.format_map(Values({**results, "origin": origin})).strip()
+    caption = Cells().format(table.caption, **{**results, "origin": origin}).strip()
     return "\n\n".join(filter(None, [markdown(table, results) if table.columns else "", caption]))
 
 
@@ -143,7 +135,7 @@ def markdown(table: Table, results: Results) -> str:
 
 def _cell(form: str, row: Mapping[str, Any], results: Results) -> str:
     named = Template(form).safe_substitute(name=row["name"], label=row["label"])
-    text = " ".join(named.format_map(Values({**results, **row})).split())
+    text = " ".join(Cells().format(named, **{**results, **row}).split())
     return "-" if text.startswith("- ") else text  # a unit behind a missing value says nothing
 
 

@@ -93,27 +93,21 @@ def error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> flo
     return abs(math.degrees(float(doubled.angle())) / 2)
 
 
-def largest_error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> float:
-    """The largest `error_deg` of a frame, of those that the benchmark would score."""
-    frames = zip(aolp[WARM_UP:], dolp[WARM_UP:], strict=True)
-    return max(error_deg(*frame, polarizer_deg) for frame in frames)
-
-
 def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
     """Errors of the AoLP that `polarnet recover` and the recording's own frames give."""
     out = recording.with_suffix("")
-    command = ["recover", str(recording), "--mosaic", MOSAIC_TEXT, "--out", str(out), "--write", "zarr"]
-    if polarnet(command):
-        raise SystemExit(f"polarnet {' '.join(command)} failed")
+    if polarnet(["recover", str(recording), "--mosaic", MOSAIC_TEXT, "--out", str(out), "--write", "zarr"]):
+        raise SystemExit(f"polarnet recover {recording} failed")
     group = zarr.open_group(out / "recovered.zarr", mode="r")
     aolp, dolp = (torch.from_numpy(np.asarray(group[name]).astype(np.float64)) for name in ("aolp", "dolp"))
     aolp *= math.pi / 2**16
+    scored = zip(aolp[WARM_UP:], dolp[WARM_UP:], strict=True)  # frames that the benchmark would score
     truth = read_truth(recording, MOSAIC)
     return {
         "polarizer_deg": polarizer_deg,
         "format": recording.suffix.removeprefix("."),
         "aolp_error_deg": error_deg(aolp, dolp, polarizer_deg),
-        "frame_aolp_error_deg_max": largest_error_deg(aolp, dolp, polarizer_deg),
+        "frame_aolp_error_deg_max": max(error_deg(*frame, polarizer_deg) for frame in scored),
         "frames_aolp_error_deg": error_deg(truth.aolp[truth.valid], truth.dolp[truth.valid], polarizer_deg),
     }
 

@@ -129,17 +129,10 @@ def peak_of_array(path: str) -> float:
     return round(peak_mib(), 1)
 
 
-def measured(task: Callable[[str], Any] | Callable[[str, str], Any], *about: str) -> Any:
-    """Result of a task in a process of its own."""
-    figure = in_own_process(task, *about)
-    print(*about, figure, flush=True)
-    return figure
-
-
 def measure_readers(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """Speed of the readers and writers."""
-    files = {name: measured(speed_of_reader, name) for name in FILES}
-    writers = {form: measured(speed_of_writer, form) for form in FORMS}
+    files = {name: in_own_process(speed_of_reader, name) for name in FILES}
+    writers = {form: in_own_process(speed_of_writer, form) for form in FORMS}
     return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
 
 
@@ -154,8 +147,8 @@ def measure_memory(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, f"recording{suffix}")
                 write(path, parts(size, *MEMORY_SENSOR))
-                peaks[size] = {name: measured(peak_of_command, name, str(path)) for name in COMMANDS}
-                peaks[size]["array"] = measured(peak_of_array, str(path))
+                peaks[size] = {name: in_own_process(peak_of_command, name, str(path)) for name in COMMANDS}
+                peaks[size]["array"] = in_own_process(peak_of_array, str(path))
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
         few, many = MEMORY_SIZES[1:3]

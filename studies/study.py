@@ -84,15 +84,16 @@ def measure_sections(
 
 
 def in_own_process(function: Callable[..., Any], *arguments: str | int, root: Path = ROOT) -> Any:
-    """Result of a function of a module in a process of its own, as JSON; RuntimeError with its messages if it fails.
+    """Print and return the result, as JSON, of a function of a module in a process of its own.
 
-    `root` is the checkout whose modules the process imports.
+    `root` is the checkout whose modules the process imports. RuntimeError with the messages of a process that fails.
     """
     module, name = function.__globals__["__spec__"].name, function.__name__
     code = f"import json; from {module} import {name}; print(json.dumps({name}(*{arguments})))"
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{name}{arguments} failed:\n{done.stderr[-2000:]}")
+    print(f"{name}{arguments}", done.stdout.splitlines()[-1], flush=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
