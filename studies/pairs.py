@@ -1,5 +1,6 @@
 """Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole."""
 
+import contextlib
 import itertools
 import os
 import shutil
@@ -103,8 +104,7 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
         f"{one} and {other} at once": dict.fromkeys(("waited", "refused", "unnamed", "traceback", "lost", "stuck"), 0)
         for one, other in both
     }
-    before = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         prepare(run_folder, Path(folder, "project"))
         output = Path(folder, "output")
         expected: dict[str, list[str | None]] = {}
@@ -126,7 +126,6 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
             counts[f"{one} and {other} at once"][what] += 1
             if what not in ("waited", "refused"):
                 print(f"{what}: {one} and {other}, {delay:.2f} s apart: {message}", flush=True)
-        os.chdir(before)
     return counts
 
 

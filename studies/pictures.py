@@ -60,24 +60,12 @@ VARIATIONS = {
 """Parameters of the pixel, and their values and unit in a picture."""
 
 
-FIGURES: dict[str, Callable[[], Figure]] = {}
-"""What draws each figure, by its file."""
-
-
-def drawn(name: str, width: float, height: float) -> Callable[[Callable[[Figure], None]], Callable[[], Figure]]:
-    """Decorator: `draw(figure)` becomes an entry of `FIGURES` in the style of docs; sizes in inches."""
-
-    def enter(draw: Callable[[Figure], None]) -> Callable[[], Figure]:
-        @styled(LIGHT)
-        def make() -> Figure:
-            figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
-            draw(figure)
-            return figure
-
-        FIGURES[name] = make
-        return make
-
-    return enter
+@styled(LIGHT)
+def drawn(draw: Callable[[Figure], None], width: float, height: float) -> Figure:
+    """A figure in the style of docs; sizes in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
+    draw(figure)
+    return figure
 
 
 def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -105,7 +93,6 @@ def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int =
     return events_under(light_of_one_pixel(t_us / 1000), t_us, config, pixels, key=3)
 
 
-@drawn("simulation_parameters.png", 9.0, 5.2)
 def parameters_figure(figure: Figure) -> None:
     """Draw one pixel's events for several values of each physical parameter."""
     t_ms = np.linspace(0, DURATION_MS, 2001)
@@ -128,7 +115,6 @@ def parameters_figure(figure: Figure) -> None:
         axes.set_xlabel("ms")
 
 
-@drawn("simulation_crossings.png", 9.0, 2.9)
 def crossings_figure(figure: Figure) -> None:
     """Draw the threshold crossings of log intensity, and their times by `exact` and `v2e`, from frames at 60 Hz."""
     rate_hz, threshold = 60.0, QUIET.contrast_threshold_on
@@ -183,7 +169,6 @@ EVENT_STYLES: tuple[dict[str, Any], ...] = (
 V2E_NOISE = (0.0551, 0.211)  # deviation, and events of each sign per second in two runs (tests of the emulator's noise)
 
 
-@drawn("theory_gains.png", 7.2, 2.0)
 def gains_figure(figure: Figure) -> None:
     """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
     scene = scene_from_rgb(read_rgb(COFFEE))
@@ -201,7 +186,6 @@ def gains_figure(figure: Figure) -> None:
         axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
 
 
-@drawn("physics_light.png", 9.0, 2.9)
 def light_figure(figure: Figure) -> None:
     """Draw the sensitivity over light, and the events of each pixel model."""
     sensitivity, events = figure.subplots(1, 2)
@@ -226,7 +210,6 @@ def light_figure(figure: Figure) -> None:
     events.set_title("a swing by e² once a second", loc="left", fontsize=9)
 
 
-@drawn("physics_options.png", 9.0, 2.7)
 def options_figure(figure: Figure) -> None:
     """Draw the events of the photoreceptor's noise against its deviation, and of a ramp by both refractory periods."""
     noise, ramp = figure.subplots(1, 2)
@@ -269,7 +252,6 @@ QUALITY, WIDTH = 80, 1560  # of WebP; twice the width of a page of GitHub
 KEY = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
 
 
-@drawn("overview.webp", 13.0, 4.9)
 def overview_figure(figure: Figure) -> None:
     """Draw the way of one window, on a transparent background with grey labels for light and dark pages."""
     figure.set_facecolor("none")
@@ -355,9 +337,20 @@ def pictures_of_demo() -> dict[str, bytes]:
         return {"simulate.png": preview, "recover.png": buffer.getvalue()}
 
 
+FIGURES: dict[str, tuple[Callable[[Figure], None], float, float]] = {
+    "simulation_parameters.png": (parameters_figure, 9.0, 5.2),
+    "simulation_crossings.png": (crossings_figure, 9.0, 2.9),
+    "theory_gains.png": (gains_figure, 7.2, 2.0),
+    "physics_light.png": (light_figure, 9.0, 2.9),
+    "physics_options.png": (options_figure, 9.0, 2.7),
+    "overview.webp": (overview_figure, 13.0, 4.9),
+}
+"""Function, width and height of each figure, by its file."""
+
+
 def main() -> None:
     """Draw all pictures into docs."""
-    for name, content in {**{name: png(draw()) for name, draw in FIGURES.items()}, **pictures_of_demo()}.items():
+    for name, content in ({name: png(drawn(*figure)) for name, figure in FIGURES.items()} | pictures_of_demo()).items():
         (PICTURES / name).write_bytes(webp(content) if name.endswith("webp") else few_colours(content))
 
 

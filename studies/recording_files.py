@@ -38,7 +38,7 @@ def parts_of(events: Events, size: int) -> Iterator[list[np.ndarray]]:
         yield columns_of(slice_count(events, start, start + size))
 
 
-def binary(header: str, content_of: Callable[..., bytes], size: int = TEXT_LINES) -> Writer:
+def binary(header: str, content_of: Callable[..., bytes | np.ndarray], size: int = TEXT_LINES) -> Writer:
     """A writer of a header, with {height} and {width}, and of the bytes of the columns, `size` events at a time."""
 
     def write(path: Path, events: Events) -> None:
@@ -49,10 +49,20 @@ def binary(header: str, content_of: Callable[..., bytes], size: int = TEXT_LINES
     return write
 
 
+def separated(*columns: np.ndarray, by: str = ",") -> bytes:
+    """Lines of whole numbers."""
+    return lines_of(np.stack(columns, axis=1), by)
+
+
 def evt2(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Words of 32 bits."""
     words = np.stack([8 << 28 | t >> 6, p << 28 | (t & 63) << 22 | x << 11 | y], axis=1)
     return words[np.stack([np.diff(t >> 6, prepend=-1) != 0, t >= 0], axis=1)].astype("<u4")
+
+
+def evt21(*columns: np.ndarray) -> np.ndarray:
+    """Words of 64 bits, whose lower half says which of 32 pixels from x on have the event: the first."""
+    return evt2(*columns).astype("<u8") << np.uint64(32) | np.uint64(1)
 
 
 def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
@@ -138,13 +148,11 @@ def table_writer(name: str) -> Writer:
         with h5py.File(path, "w") as file:
             file.attrs["height"], file.attrs["width"] = events.height, events.width
             for table, fields in tables.items():
-                if None in fields:
-                    content = fields[None]
-                elif 0 in fields:
+                if 0 in fields:
                     content = np.stack([fields[k] for k in range(len(fields))], axis=1)
                 else:
                     kinds_of = [(field, column.dtype) for field, column in fields.items()]
-                    content = np.rec.fromarrays([*fields.values()], dtype=kinds_of)
+                    content = fields[None] if None in fields else np.rec.fromarrays([*fields.values()], dtype=kinds_of)
                 file.create_dataset(table, data=content, chunks=True)
 
     return write
@@ -171,6 +179,7 @@ def messages(content_of: Callable[..., bytes], kind: str, plugin: str | None) ->
 
 
 PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
+DAT = "% Version 2\n% Height {height}\n% Width {width}\n\x0c\x08"
 AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
 FILES: dict[str, tuple[str, Writer]] = {
     **{name: (".h5", table_writer(name)) for name in LAYOUTS},
@@ -182,33 +191,18 @@ FILES: dict[str, tuple[str, Writer]] = {
     "aedat2": (".aedat", lambda path, events: write_aedat2(path, events, NO_TIMES, NO_FRAMES)),
     "event_stream": (".es", with_faery),
     "evt": (".raw", binary(PROPHESEE.format(v="3.0"), evt3)),
-    "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), lambda *columns: evt2(*columns).tobytes())),
-    "evt 2.1": (
-        ".raw",
-        binary(
-            PROPHESEE.format(v="2.1"),
-            lambda *columns: (evt2(*columns).astype("<u8") << np.uint64(32) | np.uint64(1)).tobytes(),
-        ),
-    ),
-    "dat": (
-        ".dat",
-        binary(
-            "% Version 2\n% Height {height}\n% Width {width}\n\x0c\x08",
-            lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes(),
-        ),
-    ),
+    "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), evt2)),
+    "evt 2.1": (".raw", binary(PROPHESEE.format(v="2.1"), evt21)),
+    "dat": (".dat", binary(DAT, lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4"))),
     "text": (".txt", write_text),
-    "text of microseconds": (
-        ".txt",
-        binary("{width} {height}\n", lambda *columns: lines_of(np.stack(columns, axis=1), " ")),
-    ),
+    "text of microseconds": (".txt", binary("{width} {height}\n", lambda *columns: separated(*columns, by=" "))),
     "text, CSV of Prophesee": (
         ".csv",
-        binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
+        binary("%geometry:{width},{height}\n", lambda t, x, y, p: separated(x, y, p, t)),
     ),
     "celex5_csv": (
         ".csv",
-        binary("", lambda t, x, y, p: lines_of(np.stack([y, x, 0 * t + celex5.WHITE // 2, 2 * p - 1, t], axis=1), ",")),
+        binary("", lambda t, x, y, p: separated(y, x, np.full_like(t, celex5.WHITE // 2), 2 * p - 1, t)),
     ),
     "celex5_bin": (".bin", write_celex5_bin),
 }
