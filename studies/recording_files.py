@@ -38,7 +38,7 @@ def parts_of(events: Events, size: int) -> Iterator[list[np.ndarray]]:
         yield columns_of(slice_count(events, start, start + size))
 
 
-def binary(header: str, content_of: Callable[..., bytes | np.ndarray], size: int = TEXT_LINES) -> Writer:
+def binary(header: str, content_of: Callable[..., Any], size: int = TEXT_LINES) -> Writer:
     """A writer of a header, with {height} and {width}, and of the bytes of the columns, `size` events at a time."""
 
     def write(path: Path, events: Events) -> None:
