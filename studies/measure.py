@@ -48,8 +48,8 @@ STUDIES = {
     ("recordings", "memory"): "studies.recordings --only memory --write",
     ("recordings", "cases"): "studies.recordings --only cases --write",
     ("recordings", "pdavis"): "studies.pdavis {work}/pdavis --write",
-    ("camera", "defects"): "studies.camera --write",
-    ("light", "dolp"): "studies.light --write",
+    ("camera", "defects"): "studies.camera --only defects --write",
+    ("light", "dolp"): "studies.camera --only events dolp --write",
     ("reliability", "artefacts"): "studies.faults --write",
     ("pipeline", "demo"): "studies.measure pipeline",
 }
