@@ -84,7 +84,6 @@ def write_rig(
     recordings: RecordingsConfig,
     emulator: EmulatorConfig,
     seed: int,
-    threads: int = 1,
 ) -> RigTruth:
     """Write the eight captures of a target into `folder`, and return the truth; seed and folder name decide all chance.
 
@@ -101,7 +100,7 @@ def write_rig(
     start_us = {capture: round(delay * 1e6) for capture, delay in zip(captures, delays_s, strict=True)}
 
     camera = Camera(emulator, key=seed_for(seed, name, "emulate"))
-    channels = emulate_motion(camera, scene, path, total_us, (height, width), threads)
+    channels = emulate_motion(camera, scene, path, total_us, (height, width), threads=1)
     places = (generator.integers(0, side, config.hot_pixels).tolist() for side in recordings.sensor)
     hot = frozenset(zip(*places, strict=True))
     for capture, events in zip(EVENT_CAPTURES, channels, strict=True):
@@ -191,7 +190,7 @@ def main() -> None:
     scene = scene_from_rgb(0.1 + 0.85 * rgb)  # a black pixel has no DoLP that could be measured
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        write_rig(scratch / "raw" / name, scene, RIG, recordings, emulator, seed=1, threads=2)
+        write_rig(scratch / "raw" / name, scene, RIG, recordings, emulator, seed=1)
         (found,) = calibrate_targets([scratch / "raw" / name], scratch / "calibrated", recordings, {})
         draw_calibration(found, recordings, PICTURES / "recordings_calibration.png")
         first = EVENT_CAPTURES[0]
