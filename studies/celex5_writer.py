@@ -1,4 +1,4 @@
-"""Write BIN and CSV files of a CeleX-5, for simulated cameras and for tests of the readers."""
+"""Write BIN files of a CeleX-5, for simulated cameras and for tests of the readers."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -7,29 +7,12 @@ import numpy as np
 from jaxtyping import Int64, UInt8, UInt16
 
 from polarnet.events.stream import Events, validate
-from polarnet.recordings.formats.celex5 import (
-    CLOCK_MHZ,
-    COLUMN,
-    FULL_PICTURE,
-    HEADER,
-    HEIGHT,
-    IMU,
-    INTENSITY,
-    LENGTH,
-    PICTURE_BYTES,
-    ROW,
-    STAMP,
-    TICK_CYCLES,
-    WHITE,
-    WIDTH,
-    microseconds,
-)
-from polarnet.recordings.formats.lines import lines_of
+from polarnet.recordings.formats import celex5
+from polarnet.recordings.formats.celex5 import COLUMN, HEIGHT, ROW, WHITE, WIDTH
 from polarnet.runtime.compilation import compiled
 
 PACKAGE_GROUPS = 51_000  # 7 bytes each; the sensor sends only packages of this length
 NO_MODE = 255
-CSV_LINES = 2**18  # written at a time
 STEP = 2**15  # time stamps from one row to the next, at most
 
 
@@ -41,11 +24,12 @@ def write_celex5_bin(path: Path, events: Events) -> Events:
     ValueError for events that are out of order, before 0, off a sensor of 800 x 1280, or more than 4095 of one polarity
     in a row in a pixel.
     """
-    _check_size(events)
+    if events.height > HEIGHT or events.width > WIDTH:
+        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
     validate(events)
     if len(events) and events.t[0] < 0:
         raise ValueError(f"expected times from 0 on, got {int(events.t[0])} us")
-    stamp = -(-events.t.numpy() * CLOCK_MHZ // TICK_CYCLES)
+    stamp = -(-events.t.numpy() * celex5.CLOCK_MHZ // celex5.TICK_CYCLES)
     pixel, p = events.y.numpy().astype(np.int64) * WIDTH + events.x.numpy(), events.p.numpy()
     _, first = np.unique(pixel, return_index=True)
     darker = np.sort(first[p[first] < 0])
@@ -57,8 +41,12 @@ def write_celex5_bin(path: Path, events: Events) -> Events:
     if brightest > WHITE:
         raise ValueError(f"expected up to {WHITE} events of one polarity in a row, a pixel has {brightest}")
     items = items[:count]
-    _write_packages(path, _packed(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1)))
-    return Events.from_columns(microseconds(stamp), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
+    packages = _packages(np.stack([items & 0x3FFF, items >> 14], axis=1).reshape(-1))
+    with path.open("wb") as file:
+        file.write(_header(celex5.INTENSITY, 0, len(packages)))
+        for package in packages:
+            file.write(celex5.LENGTH.pack(package.size + 1) + package.tobytes() + b"\1")
+    return Events.from_columns(celex5.microseconds(stamp), pixel % WIDTH, pixel // WIDTH, p, HEIGHT, WIDTH)
 
 
 def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800 1280"]], t_us: Sequence[int]) -> None:
@@ -67,42 +55,23 @@ def write_celex5_pictures(path: Path, pictures: Iterable[UInt16[np.ndarray, "800
     Pixel (0, 0) is lost, since the sensor stores its mode there.
     """
     with path.open("wb") as file:
-        file.write(_header(FULL_PICTURE, IMU, len(t_us)))
+        file.write(_header(celex5.FULL_PICTURE, celex5.IMU, len(t_us)))
         for picture, t in zip(pictures, t_us, strict=True):
             if picture.shape != (HEIGHT, WIDTH) or picture.max() > WHITE:
                 raise ValueError(
                     f"expected pictures of {HEIGHT}x{WIDTH} up to {WHITE}, got {picture.shape} up to {picture.max()}"
                 )
-            file.write(LENGTH.pack(PICTURE_BYTES) + _packed_picture(picture).tobytes() + b"\0")
-            file.write(STAMP.pack(t // 1000, 0))
-
-
-def write_celex5_csv(path: Path, events: Events) -> None:
-    """Write events in the converter's Event Intensity format: lines row,col,adc,polarity,t in microseconds.
-
-    The intensity is half of the maximum. ValueError where events are not on the sensor of 800 x 1280.
-    """
-    _check_size(events)
-    adc = np.full(len(events), WHITE // 2)
-    columns = [events.y.numpy(), events.x.numpy(), adc, events.p.numpy(), events.t.numpy()]
-    with path.open("wb") as file:
-        for start in range(0, len(events), CSV_LINES):
-            part = [column[start : start + CSV_LINES] for column in columns]
-            file.write(lines_of(np.stack(part, axis=1).astype(np.int64), ","))
-
-
-def _check_size(events: Events) -> None:
-    if events.height > HEIGHT or events.width > WIDTH:
-        raise ValueError(f"expected events of a sensor of {HEIGHT}x{WIDTH}, got {events.height}x{events.width}")
+            file.write(celex5.LENGTH.pack(celex5.PICTURE_BYTES) + _packed_picture(picture).tobytes() + b"\0")
+            file.write(celex5.STAMP.pack(t // 1000, 0))
 
 
 def _header(mode: int, data_type: int, packages: int) -> bytes:
-    return HEADER.pack(data_type, mode, NO_MODE, NO_MODE, 1, 0, 0, 0, packages)
+    return celex5.HEADER.pack(data_type, mode, NO_MODE, NO_MODE, 1, 0, 0, 0, packages)
 
 
 def _packed_picture(picture: np.ndarray) -> np.ndarray:
     dark = np.uint16(WHITE) - picture.reshape(-1, 2)
-    dark[0, 0] = FULL_PICTURE << 9
+    dark[0, 0] = celex5.FULL_PICTURE << 9
     low = dark[:, 0] & 15 | (dark[:, 1] & 15) << 4
     return np.stack([dark[:, 0] >> 4, dark[:, 1] >> 4, low], axis=1).astype(np.uint8)
 
@@ -133,20 +102,10 @@ def _fill_items(stamp, pixel, p, intensity, items):
     return count, brightest
 
 
-def _packed(words: Int64[np.ndarray, " words"]) -> UInt8[np.ndarray, "groups 7"]:
+def _packages(words: Int64[np.ndarray, " words"]) -> UInt8[np.ndarray, "packages bytes"]:
     """Pack 14-bit words as the sensor sends them, in full packages; padding in the last one states the mode."""
-    padding = np.array([INTENSITY << 14 & 0x3FFF, INTENSITY << 14 >> 14])
+    padding = np.array([celex5.INTENSITY << 14 & 0x3FFF, celex5.INTENSITY << 14 >> 14])
     words = np.concatenate([words, np.resize(padding, -len(words) % (4 * PACKAGE_GROUPS))]).reshape(-1, 4)
-    low = words & 63
-    low_bytes = low[:, 0] | low[:, 1] << 6 | low[:, 2] << 12 | low[:, 3] << 18
-    high = [words[:, k] >> 6 for k in range(4)]
-    return np.stack([*high, low_bytes, low_bytes >> 8, low_bytes >> 16], axis=1).astype(np.uint8)
-
-
-def _write_packages(path: Path, groups: np.ndarray) -> None:
-    packages = len(groups) // PACKAGE_GROUPS
-    with path.open("wb") as file:
-        file.write(_header(INTENSITY, 0, packages))
-        for package in groups.reshape(packages, -1):
-            file.write(LENGTH.pack(package.size + 1))
-            file.write(package.tobytes() + b"\1")
+    low = (words & 63) @ (1 << 6 * np.arange(4))
+    groups = np.column_stack([words >> 6, low, low >> 8, low >> 16]).astype(np.uint8)
+    return groups.reshape(-1, 7 * PACKAGE_GROUPS)

@@ -1,83 +1,79 @@
 """Write the result blocks of README.md and docs/*.md from docs/results: python -m studies.docs [--check].
 
-A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`. docs/tables.yaml describes each block:
-
-- `file`: NAME of docs/results/NAME.json; a YAML file below docs/ (its list is `entries`); or `records`, for the
-  machines and commits of all measurements;
-- `section`: the part of the file whose commit the block names (the whole file if it is left out);
-- `rows`: a path such as `test/tables` to a mapping (a row for each entry, whose key is `name`) or to a list; or a
-  mapping from `label` to `name`, for rows that are chosen by hand;
-- `without`: values by key; a row that has all of them is left out;
-- `columns`: a format string for each heading, over the row's values and the whole file. `$name` and `$label` are
-  replaced before, so `{test[$name][mse]:.4f}` looks into the file. A missing value is printed as "-";
-- `caption`: a format string over the whole file; `{origin}` names the commit.
+A block lies between `<!-- results:NAME -->` and `<!-- /results:NAME -->`; docs/tables.yaml has a `Table` for each.
 """
 
 import argparse
+import functools
 import json
+import operator
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from string import Template
-from typing import Any
+from string import Formatter, Template
+from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"(<!-- results:([\w-]+) -->).*?(<!-- /results:\2 -->)", re.DOTALL)
 MARKER = re.compile(r"<!-- /?results:(?P<name>[\w-]+) -->")
-KEYS = {"file", "section", "rows", "without", "columns", "caption"}
-
 ROOT_OF = "rms"
 """Before a format: the square root of the value, such as {mse:rms.2f}."""
 
 Results = Mapping[str, Any]
 
 
-class Value:
-    """A value as a format string prints it: "-" if missing; lists and mappings are joined by commas; RMS of an MSE."""
+class Cells(Formatter):
+    """Format strings over results: "-" for a missing value; lists and mappings joined by commas; RMS of an MSE."""
 
-    def __init__(self, value: Any):
-        self.value = value
+    def get_field(self, field_name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> tuple[Any, str]:
+        """The value at a path such as test[rows][ours], or None if there is none, and the path."""
+        value: Any = kwargs
+        for key in re.findall(r"[^\[\]]+", field_name):
+            if isinstance(value, list):
+                value = value[int(key)]
+            else:
+                value = value.get(key) if isinstance(value, Mapping) else None
+        return value, field_name
 
-    def __getitem__(self, key: str | int) -> "Value":
-        if isinstance(self.value, list):
-            return Value(self.value[int(key)])
-        return Value(self.value.get(key) if isinstance(self.value, Mapping) else None)
-
-    def __format__(self, form: str) -> str:
-        value = self.value
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Text of a value."""
         if isinstance(value, Mapping):
-            return ", ".join(f"`{key}: {Value(one)}`" for key, one in value.items())
+            return ", ".join(f"`{key}: {self.format_field(one, '')}`" for key, one in value.items())
         if isinstance(value, list):
-            return ", ".join(format(Value(one), form) for one in value)
+            return ", ".join(self.format_field(one, format_spec) for one in value)
         if value is None:
             return "-"
-        if form.startswith(ROOT_OF):
-            return format(value**0.5, form.removeprefix(ROOT_OF))
-        return str(value).lower() if isinstance(value, bool) else format(value, form)
-
-    def __str__(self) -> str:
-        return format(self)
+        if format_spec.startswith(ROOT_OF):
+            return format(value**0.5, format_spec.removeprefix(ROOT_OF))
+        return str(value).lower() if isinstance(value, bool) else format(value, format_spec)
 
 
-class Values(dict[str, Any]):
-    """Values by name for `str.format_map`; a name that is not there is a missing value."""
+class Table(NamedTuple):
+    """A block: a table with a caption, or one of them."""
 
-    def __getitem__(self, key: str) -> Value:
-        return Value(self.get(key))
+    file: str
+    """NAME of docs/results/NAME.json; a YAML file below docs/, whose list is `entries`; or `records` of all files."""
+    section: str = ""
+    """The part of the file whose commit the block names; the whole file if it is left out."""
+    rows: str | Mapping[str, str] = ""
+    """A path such as `test/tables` to a mapping (a row for each entry, whose key is `name`) or to a list; or a mapping
+    from `label` to `name`, for rows that are chosen by hand."""
+    without: tuple[str, str] | None = None
+    """Key and value of rows that are left out."""
+    columns: Mapping[str, str] = {}
+    """A format string for each heading, over the row's values and the whole file. `$name` and `$label` are replaced
+    before, so `{test[$name][mse]:.4f}` looks into the file. A missing value is printed as "-"."""
+    caption: str = "{origin}"
+    """A format string over the whole file; `{origin}` names the commit."""
 
 
-def read_tables(root: Path) -> dict[str, dict[str, Any]]:
-    """The blocks of docs/tables.yaml by name; ValueError for one with an unknown key or without a file."""
+def read_tables(root: Path) -> dict[str, Table]:
+    """The blocks of docs/tables.yaml by name; TypeError for one with an unknown key or without a file."""
     tables = YAML(typ="safe").load(root / "docs" / "tables.yaml")
-    for name, table in tables.items():
-        if unknown := set(table) - KEYS:
-            raise ValueError(f"docs/tables.yaml, {name}: expected keys of {', '.join(sorted(KEYS))}, got {unknown}")
-        if "file" not in table:
-            raise ValueError(f"docs/tables.yaml, {name}: expected the key file, the name of a file in docs/results")
-    return tables
+    return {name: Table(**table) for name, table in tables.items()}
 
 
 def read_file(root: Path, name: str) -> dict[str, Any]:
@@ -108,51 +104,38 @@ def records_of(root: Path) -> dict[str, Any]:
     return {"machines": list(machines.values()), "measured": measured}
 
 
-def block_text(table: Mapping[str, Any], results: Results) -> str:
+def block_text(table: Table, results: Results) -> str:
     """Markdown of a block for the content of its file."""
-    section = table.get("section")
-    if not results or (section and section not in results):
+    if not results or (table.section and table.section not in results):
         return "Not measured yet."
-    parts = []
-    if "columns" in table:
-        parts.append(markdown(table["columns"], kept_rows(table, results), results))
-    record = results.get("records", {}).get(section) or results
+    record = results.get("records", {}).get(table.section) or results
     origin = f"Commit `{record['commit'][:10]}`." if "commit" in record else ""
-    if caption := table.get("caption", "{origin}").format_map(Values({**results, "origin": origin})):
-        parts.append(caption.strip())
-    return "\n\n".join(parts)
+    caption = Cells().format(table.caption, **{**results, "origin": origin}).strip()
+    return "\n\n".join(filter(None, [markdown(table, results) if table.columns else "", caption]))
 
 
-def kept_rows(table: Mapping[str, Any], results: Results) -> list[dict[str, Any]]:
-    """The rows of a table but for those that its key `without` leaves out."""
-    unwanted = table.get("without", {})
-    rows = rows_of(table["rows"], results)
-    return [row for row in rows if not unwanted or any(row.get(key) != value for key, value in unwanted.items())]
-
-
-def rows_of(rows: str | Mapping[str, str], results: Results) -> Iterator[dict[str, Any]]:
+def rows_of(table: Table, results: Results) -> Iterator[dict[str, Any]]:
     """The rows of a table, each with `name` and `label`; KeyError for a path that leads nowhere."""
-    if isinstance(rows, Mapping):
-        yield from ({"label": label, "name": name} for label, name in rows.items())
+    if isinstance(table.rows, Mapping):
+        yield from ({"label": label, "name": name} for label, name in table.rows.items())
         return
-    place: Any = results
-    for key in rows.split("/"):
-        place = place[key]
-    named = place.items() if isinstance(place, Mapping) else enumerate(place, start=1)
-    yield from ({"name": str(key), "label": str(key), **one} for key, one in named)
+    place: Any = functools.reduce(operator.getitem, table.rows.split("/"), results)
+    for key, one in place.items() if isinstance(place, Mapping) else enumerate(place, start=1):
+        if table.without is None or one.get(table.without[0]) != table.without[1]:
+            yield {"name": str(key), "label": str(key), **one}
 
 
-def markdown(columns: Mapping[str, str], rows: list[dict[str, Any]], results: Results) -> str:
+def markdown(table: Table, results: Results) -> str:
     """A GitHub table with numbers aligned to the right and text to the left."""
-    cells = [[_cell(form, row, results) for form in columns.values()] for row in rows]
-    numeric = [all(row[k][:1] in "+-0123456789" for row in cells) for k in range(len(columns))]
+    cells = [[_cell(form, row, results) for form in table.columns.values()] for row in rows_of(table, results)]
+    numeric = [all(cell[:1] in "+-0123456789" for cell in column) for column in zip(*cells, strict=True)]
     rule = "|".join("---:" if right else "---" for right in numeric)
-    return "\n".join([f"| {' | '.join(columns)} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in cells)])
+    return "\n".join([f"| {' | '.join(table.columns)} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in cells)])
 
 
 def _cell(form: str, row: Mapping[str, Any], results: Results) -> str:
     named = Template(form).safe_substitute(name=row["name"], label=row["label"])
-    text = " ".join(named.format_map(Values({**results, **row})).split())
+    text = " ".join(Cells().format(named, **{**results, **row}).split())
     return "-" if text.startswith("- ") else text  # a unit behind a missing value says nothing
 
 
@@ -175,12 +158,12 @@ def update_pages(root: Path, check: bool) -> list[Path]:
     return changed
 
 
-def _with_blocks(text: str, page: Path, tables: Mapping[str, Mapping[str, Any]], root: Path) -> str:
+def _with_blocks(text: str, page: Path, tables: Mapping[str, Table], root: Path) -> str:
     def rewritten(block: re.Match[str]) -> str:
         start, name, end = block.groups()
         if name not in tables:
             raise ValueError(f"{page}: docs/tables.yaml has no block {name}; expected one of {', '.join(tables)}")
-        return f"{start}\n\n{block_text(tables[name], read_file(root, tables[name]['file']))}\n\n{end}"
+        return f"{start}\n\n{block_text(tables[name], read_file(root, tables[name].file))}\n\n{end}"
 
     if open_marker := MARKER.search(BLOCK.sub("", text)):
         name = open_marker["name"]

@@ -1,6 +1,6 @@
 """The paper's Fig. 11, how many events DoLP needs, on the test sequences that the pipeline made.
 
-python -m studies.event_budget [--weights FILE] [--out FOLDER]
+python -m studies.event_budget [--weights FILE]
 
 For a sequence of each test set, DoLP from the events of one window alone, without a state: a window that grows from 0
 to t (figure_11a_SET), or one that holds the last 1.04 events per pixel (figure_11b_SET). Events per pixel are the mean
@@ -30,6 +30,7 @@ from polarnet.reports.maps import dolp_image, event_full_scale, event_image, wri
 from studies.study import ROOT
 
 PAPER_EVENTS_PER_PIXEL = 1.04  # at which the paper's recovery is good (section 5)
+OUT = Path("outputs", "event_budget")
 GROWING = (0.1, 0.25, 0.5, PAPER_EVENTS_PER_PIXEL, 2.0, 4.0)  # events per pixel in the windows of Fig. 11a
 
 
@@ -86,21 +87,20 @@ def main() -> None:
     """Draw a sequence of each test set of the paper."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weights", type=Path, help="checkpoint of ours (default: the pipeline's)")
-    parser.add_argument("--out", type=Path, default=Path("outputs", "event_budget"))
     arguments = parser.parse_args()
     config = load(ROOT)
     context = context_of(config, ["ours"], 0.0, arguments.weights)
     if reason := available(["ours"], context)[1].get("ours"):
         parser.error(f"the event budget needs the DoLP network: {reason}; give --weights FILE")
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    OUT.mkdir(parents=True, exist_ok=True)
     recoverer = opened(METHODS["ours"], context)
     for name in {"simulated", "recordings"} & {*set_names(config)}:
         one = pipeline_set(config, name)
         sequence = one.sequence(one.sequences[0])
         for part, windows in windows_of_figure_11(sequence.events, int(sequence.t_us[-1])).items():
             figure = figure_11(sequence, windows, recovered_alone(windows, recoverer))
-            write_figure(figure, arguments.out / f"figure_11{part}_{name}")
-    print(f"wrote to {arguments.out}: {', '.join(sorted(path.name for path in arguments.out.iterdir()))}")
+            write_figure(figure, OUT / f"figure_11{part}_{name}")
+    print(f"wrote to {OUT}: {', '.join(sorted(path.name for path in OUT.iterdir()))}")
 
 
 if __name__ == "__main__":

@@ -11,12 +11,13 @@
 --only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
 
+import argparse
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import io
 import itertools
-import json
 import multiprocessing
 import os
 import shutil
@@ -46,12 +47,11 @@ from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import read_history
 from studies.pairs import pairs
-from studies.study import ROOT, arguments_of, command_line, machine_record, read_results, write_section
+from studies.study import ROOT, command_line, measure_sections, read_results
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
 MAX_RENAMES = 51  # of `write_store` on an old store
 TEXTS = (".json", ".csv", "SHA256SUMS")
-SECTIONS = ("artefacts", "kills", "names", "pairs")
 FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
 OUTCOMES = ("refused", "harmless", *FAILURES[:4])
 Generator = np.random.Generator
@@ -319,40 +319,33 @@ def hostile_names() -> dict[str, dict[str, int]]:
     return counts
 
 
-def headlines(sections: Mapping[str, Any]) -> dict[str, int]:
-    """Counts over all kinds of faults."""
-    kinds = [one for name in SECTIONS for one in sections.get(name, {}).values()]
-    names = {"lost": "faults_lost", "silent": "silent_uses", "outside": "outside_writes", "traceback": "tracebacks"}
-    return {
-        "faults_injected": sum(sum(one.values()) for one in kinds),
-        "kinds": len(kinds),
-        "stuck": sum(one.get("stuck", 0) for one in kinds),
-        **{name: sum(one.get(what, 0) for one in kinds) for what, name in names.items()},
-    }
+SECTIONS: dict[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
+    "artefacts": lambda given: inject(given.runs, given.faults, seed=1)[0],
+    "kills": lambda given: kills(given.kills),
+    "names": lambda _: hostile_names(),
+    "pairs": lambda given: pairs(given.runs[0], given.pairs),
+}
+HEADLINES = {
+    "stuck": "stuck", "lost": "faults_lost", "silent": "silent_uses", "outside": "outside_writes",
+    "traceback": "tracebacks",
+}  # fmt: skip
+"""Name of each failure among the headlines."""
 
 
-def main() -> None:
-    """The command line."""
+def measure(name: str, given: argparse.Namespace) -> tuple[Mapping[str, Any], Mapping[str, int]]:
+    """Counts of one of `SECTIONS`, and over all kinds of faults, with the counts of docs/results for other sections."""
+    counts = SECTIONS[name](given)
+    known = {**read_results("reliability"), name: counts}
+    kinds = [one for section in SECTIONS for one in known.get(section, {}).values()]
+    injected = {"faults_injected": sum(sum(one.values()) for one in kinds), "kinds": len(kinds)}
+    return counts, injected | {key: sum(one.get(what, 0) for one in kinds) for what, key in HEADLINES.items()}
+
+
+if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--only", choices=SECTIONS, help="default: all")
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=100, help="of stores")
     parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
-    arguments = arguments_of(parser)
-    studies: dict[str, Callable[[], Mapping[str, Any]]] = {
-        "artefacts": lambda: inject(arguments.runs, arguments.faults, seed=1)[0],
-        "kills": lambda: kills(arguments.kills),
-        "names": hostile_names,
-        "pairs": lambda: pairs(arguments.runs[0], arguments.pairs),
-    }
-    for name in [arguments.only] if arguments.only else studies:
-        record, figures = machine_record(), studies[name]()
-        print(name, json.dumps(figures, indent=2))
-        if arguments.write:
-            known = {**read_results("reliability"), name: figures}
-            write_section("reliability", name, figures, record, headlines(known))
-
-
-if __name__ == "__main__":
-    main()
+    sections = {name: ("reliability", name, functools.partial(measure, name)) for name in SECTIONS}
+    measure_sections(parser, sections)

@@ -44,12 +44,12 @@ STUDIES = {
     ("robustness", "bounds"): f"studies.registration --work {{work}}/registration {SETS} --write",
     ("emulation", "models"): "studies.speed --only simulation --write",
     ("speed", "live"): "studies.speed --only live --write",
-    ("recordings", "readers"): "studies.recordings --sections readers --write",
-    ("recordings", "memory"): "studies.recordings --sections memory --write",
-    ("recordings", "cases"): "studies.recordings --sections cases --write",
+    ("recordings", "readers"): "studies.recordings --only readers --write",
+    ("recordings", "memory"): "studies.recordings --only memory --write",
+    ("recordings", "cases"): "studies.recordings --only cases --write",
     ("recordings", "pdavis"): "studies.pdavis {work}/pdavis --write",
-    ("camera", "defects"): "studies.camera --write",
-    ("light", "dolp"): "studies.light --write",
+    ("camera", "defects"): "studies.camera --only defects --write",
+    ("light", "dolp"): "studies.camera --only events dolp --write",
     ("reliability", "artefacts"): "studies.faults --write",
     ("pipeline", "demo"): "studies.measure pipeline",
 }
@@ -115,7 +115,6 @@ def measure_pipeline() -> Path:
         clone = Path(folder) / "polarnet"
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
         figures: dict[str, Any] = {f"{target}_minutes": minutes_of(target, clone) for target in ("setup", "repro")}
-        figures["metrics"] = scores_and_costs(clone / "data" / "benchmark" / "sets" / "simulated")
         (ROOT / DEMO_METRICS).parent.mkdir(parents=True, exist_ok=True)
         for name in ("dvc.lock", DEMO_METRICS):
             shutil.copy(clone / name, ROOT / name)
@@ -134,12 +133,7 @@ def measure_run(name: str, data: Path) -> Path:
     """Write docs/results/NAME.json from the simulated test set of a finished run in the folder `data`."""
     folder = data / "benchmark" / "sets" / "simulated"
     details = json.loads((folder / "details.json").read_text(encoding="utf-8"))
-    figures = {
-        "scenes": len(details["scenes"]),
-        "frames": details["frames"],
-        "rows": scores_and_costs(folder),
-        "paired": {row: one["mse"] for row, one in details["paired"].items()},
-    }
+    figures = {"scenes": len(details["scenes"]), "frames": details["frames"], "rows": scores_and_costs(folder)}
     return write_section(name, RUNS[name], figures, machine_record())
 
 

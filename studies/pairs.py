@@ -1,5 +1,6 @@
 """Commands that run two at once and write to one place: the second must wait or refuse, and one result stay whole."""
 
+import contextlib
 import itertools
 import os
 import shutil
@@ -11,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
+from omegaconf import OmegaConf
 
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.runtime.files import files_of, sha256
@@ -85,12 +86,7 @@ def prepare(run_folder: Path, scratch: Path) -> None:
     shutil.copytree(run_folder, scratch, ignore=shutil.ignore_patterns(".git", "cache", "tmp"), symlinks=True)
     os.chdir(scratch)
     Path(".dvc", "config.local").write_text("[core]\n    no_scm = true\n    analytics = false\n")
-    yaml = YAML()
-    params = yaml.load(Path("params.yaml"))
-    for section, values in TINY.items():
-        for key, value in values.items():
-            params[section][key] = {**params[section][key], **value} if isinstance(value, dict) else value
-    yaml.dump(params, Path("params.yaml"))
+    OmegaConf.save(OmegaConf.merge(OmegaConf.load("params.yaml"), TINY), "params.yaml")
     config = Path("conf", "config.yaml")
     config.write_text(config.read_text().replace("threads: 0", "threads: 1"))
     first, *_, last = EventStore.open(STORE).sequences
@@ -108,8 +104,7 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
         f"{one} and {other} at once": dict.fromkeys(("waited", "refused", "unnamed", "traceback", "lost", "stuck"), 0)
         for one, other in both
     }
-    before = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         prepare(run_folder, Path(folder, "project"))
         output = Path(folder, "output")
         expected: dict[str, list[str | None]] = {}
@@ -131,7 +126,6 @@ def pairs(run_folder: Path, cases: int) -> dict[str, dict[str, int]]:
             counts[f"{one} and {other} at once"][what] += 1
             if what not in ("waited", "refused"):
                 print(f"{what}: {one} and {other}, {delay:.2f} s apart: {message}", flush=True)
-        os.chdir(before)
     return counts
 
 

@@ -6,6 +6,7 @@ FOLDER gets pdavis_ANGLE.aedat, .aedat4 and .h5, each with events and frames. Ao
 file, and AoLP of its frames, are compared with the polarizer's. --write: docs/results/recordings.json, section pdavis.
 """
 
+import argparse
 import math
 from datetime import timedelta
 from pathlib import Path
@@ -28,7 +29,7 @@ from polarnet.stokes import POLARIZER_ANGLES_DEG, intensities_from_stokes, stoke
 from polarnet.storage.events import EventStore
 from polarnet.storage.true_frames import APPENDED, open_truth
 from studies.recording_files import EXPOSURE_US, WHITE, mosaicked, write_aedat2, write_e2p
-from studies.study import arguments_of, command_line, machine_record, write_section
+from studies.study import command_line, measure_sections
 
 MOSAIC_TEXT = "90 45 / 135 0"
 POLARIZERS_DEG, TRUE_DOLP = (0, 30, 90), 0.8
@@ -92,45 +93,33 @@ def error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> flo
     return abs(math.degrees(float(doubled.angle())) / 2)
 
 
-def largest_error_deg(aolp: torch.Tensor, dolp: torch.Tensor, polarizer_deg: int) -> float:
-    """The largest `error_deg` of a frame, of those that the benchmark would score."""
-    frames = zip(aolp[WARM_UP:], dolp[WARM_UP:], strict=True)
-    return max(error_deg(*frame, polarizer_deg) for frame in frames)
-
-
 def score(recording: Path, polarizer_deg: int) -> dict[str, Any]:
     """Errors of the AoLP that `polarnet recover` and the recording's own frames give."""
     out = recording.with_suffix("")
-    command = ["recover", str(recording), "--mosaic", MOSAIC_TEXT, "--out", str(out), "--write", "zarr"]
-    if polarnet(command):
-        raise SystemExit(f"polarnet {' '.join(command)} failed")
+    if polarnet(["recover", str(recording), "--mosaic", MOSAIC_TEXT, "--out", str(out), "--write", "zarr"]):
+        raise SystemExit(f"polarnet recover {recording} failed")
     group = zarr.open_group(out / "recovered.zarr", mode="r")
     aolp, dolp = (torch.from_numpy(np.asarray(group[name]).astype(np.float64)) for name in ("aolp", "dolp"))
     aolp *= math.pi / 2**16
+    scored = zip(aolp[WARM_UP:], dolp[WARM_UP:], strict=True)  # frames that the benchmark would score
     truth = read_truth(recording, MOSAIC)
     return {
         "polarizer_deg": polarizer_deg,
         "format": recording.suffix.removeprefix("."),
         "aolp_error_deg": error_deg(aolp, dolp, polarizer_deg),
-        "frame_aolp_error_deg_max": largest_error_deg(aolp, dolp, polarizer_deg),
+        "frame_aolp_error_deg_max": max(error_deg(*frame, polarizer_deg) for frame in scored),
         "frames_aolp_error_deg": error_deg(truth.aolp[truth.valid], truth.dolp[truth.valid], polarizer_deg),
     }
 
 
-def main() -> None:
-    """The command line."""
-    parser = command_line(__doc__, "docs/results/recordings.json")
-    parser.add_argument("folder", type=Path, help="folder for the files")
-    arguments = arguments_of(parser)
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    record, rows = machine_record(), []
-    for polarizer_deg in POLARIZERS_DEG:
-        for recording in write_recordings(simulate(arguments.folder, polarizer_deg), arguments.folder, polarizer_deg):
-            rows.append(score(recording, polarizer_deg))
-            print(rows[-1], flush=True)
-    if arguments.write:
-        write_section("recordings", "pdavis", {"files": rows}, record)
+def measure(given: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Errors of each file."""
+    given.folder.mkdir(parents=True, exist_ok=True)
+    angles = [(write_recordings(simulate(given.folder, deg), given.folder, deg), deg) for deg in POLARIZERS_DEG]
+    return {"files": [score(recording, deg) for recordings, deg in angles for recording in recordings]}, {}
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, "docs/results/recordings.json")
+    parser.add_argument("folder", type=Path, help="folder for the files")
+    measure_sections(parser, {"pdavis": ("recordings", "pdavis", measure)})

@@ -1,10 +1,9 @@
-"""Draw the pictures of docs: python -m studies.pictures [FOLDER]
+"""Draw the pictures of docs: python -m studies.pictures
 
 Every line, event and picture in them comes from the simulation, the shipped weights and the demo; where a formula is
-drawn, its label says so. `studies.rig` draws those of the pages on recordings.
+drawn, its label says so. `studies.simulated_rig` draws those of the pages on recordings.
 """
 
-import argparse
 import io
 import json
 import math
@@ -61,19 +60,12 @@ VARIATIONS = {
 """Parameters of the pixel, and their values and unit in a picture."""
 
 
-def drawn(width: float, height: float) -> Callable[[Callable[[Figure], None]], Callable[[], Figure]]:
-    """Decorator: `draw(figure)` becomes a function that returns the figure, in the style of docs; sizes in inches."""
-
-    def of(draw: Callable[[Figure], None]) -> Callable[[], Figure]:
-        @styled(LIGHT)
-        def make() -> Figure:
-            figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
-            draw(figure)
-            return figure
-
-        return make
-
-    return of
+@styled(LIGHT)
+def drawn(draw: Callable[[Figure], None], width: float, height: float) -> Figure:
+    """A figure in the style of docs; sizes in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
+    draw(figure)
+    return figure
 
 
 def light_of_one_pixel(t_ms: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
@@ -101,7 +93,6 @@ def pixel_events(config: EmulatorConfig, rate_hz: float = RATE_HZ, pixels: int =
     return events_under(light_of_one_pixel(t_us / 1000), t_us, config, pixels, key=3)
 
 
-@drawn(9.0, 5.2)
 def parameters_figure(figure: Figure) -> None:
     """Draw one pixel's events for several values of each physical parameter."""
     t_ms = np.linspace(0, DURATION_MS, 2001)
@@ -124,7 +115,6 @@ def parameters_figure(figure: Figure) -> None:
         axes.set_xlabel("ms")
 
 
-@drawn(9.0, 2.9)
 def crossings_figure(figure: Figure) -> None:
     """Draw the threshold crossings of log intensity, and their times by `exact` and `v2e`, from frames at 60 Hz."""
     rate_hz, threshold = 60.0, QUIET.contrast_threshold_on
@@ -179,7 +169,6 @@ EVENT_STYLES: tuple[dict[str, Any], ...] = (
 V2E_NOISE = (0.0551, 0.211)  # deviation, and events of each sign per second in two runs (tests of the emulator's noise)
 
 
-@drawn(7.2, 2.0)
 def gains_figure(figure: Figure) -> None:
     """Draw true DoLP, DoLP with wrong factors of the polarizers, and DoLP with factors from the redundancy."""
     scene = scene_from_rgb(read_rgb(COFFEE))
@@ -197,7 +186,6 @@ def gains_figure(figure: Figure) -> None:
         axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
 
 
-@drawn(9.0, 2.9)
 def light_figure(figure: Figure) -> None:
     """Draw the sensitivity over light, and the events of each pixel model."""
     sensitivity, events = figure.subplots(1, 2)
@@ -222,7 +210,6 @@ def light_figure(figure: Figure) -> None:
     events.set_title("a swing by e² once a second", loc="left", fontsize=9)
 
 
-@drawn(9.0, 2.7)
 def options_figure(figure: Figure) -> None:
     """Draw the events of the photoreceptor's noise against its deviation, and of a ramp by both refractory periods."""
     noise, ramp = figure.subplots(1, 2)
@@ -265,7 +252,6 @@ QUALITY, WIDTH = 80, 1560  # of WebP; twice the width of a page of GitHub
 KEY = "hue → AoLP\nsaturation → DoLP\nvalue → S0"
 
 
-@drawn(13.0, 4.9)
 def overview_figure(figure: Figure) -> None:
     """Draw the way of one window, on a transparent background with grey labels for light and dark pages."""
     figure.set_facecolor("none")
@@ -276,13 +262,8 @@ def overview_figure(figure: Figure) -> None:
     recovered = recover(simulation.events, t_us=simulation.t_us).prediction.dolp[WINDOW]
     full, s0 = torch.ones_like(dolp), intensities[::2].sum(0)
     columns = figure.subfigures(1, len(WIDTHS), squeeze=False, width_ratios=WIDTHS)[0]
-    headings = (
-        "photograph",
-        "→ polarization",
-        "→ polarizers",
-        f"→ events, {(stop_us - start_us) / 1e3:.0f} ms",
-        "→ DoLP",
-    )
+    events_heading = f"→ events, {(stop_us - start_us) / 1e3:.0f} ms"
+    headings = "photograph", "→ polarization", "→ polarizers", events_heading, "→ DoLP"
     for part, heading in zip(columns, headings, strict=True):
         part.set_facecolor("none")
         part.suptitle(heading, color=LABEL, fontsize=13, weight="bold")
@@ -344,7 +325,7 @@ def webp(content: bytes) -> bytes:
 
 
 def pictures_of_demo() -> dict[str, bytes]:
-    """The preview and the last frame of the video that `polarnet demo` writes."""
+    """The preview and the last frame of the video that `polarnet demo` writes, as PNG by their files."""
     with tempfile.TemporaryDirectory() as folder:
         if polarnet(["demo", "--out", folder]):
             raise SystemExit("polarnet demo failed")
@@ -352,27 +333,25 @@ def pictures_of_demo() -> dict[str, bytes]:
             *_, last = video.decode(video=0)
         buffer = io.BytesIO()
         last.to_image().save(buffer, format="png")
-        return {"simulate": Path(folder, "simulated", "preview.png").read_bytes(), "recover": buffer.getvalue()}
+        preview = Path(folder, "simulated", "preview.png").read_bytes()
+        return {"simulate.png": preview, "recover.png": buffer.getvalue()}
 
 
-FIGURES = {
-    "simulation_parameters": parameters_figure,
-    "simulation_crossings": crossings_figure,
-    "theory_gains": gains_figure,
-    "physics_light": light_figure,
-    "physics_options": options_figure,
+FIGURES: dict[str, tuple[Callable[[Figure], None], float, float]] = {
+    "simulation_parameters.png": (parameters_figure, 9.0, 5.2),
+    "simulation_crossings.png": (crossings_figure, 9.0, 2.9),
+    "theory_gains.png": (gains_figure, 7.2, 2.0),
+    "physics_light.png": (light_figure, 9.0, 2.9),
+    "physics_options.png": (options_figure, 9.0, 2.7),
+    "overview.webp": (overview_figure, 13.0, 4.9),
 }
+"""Function, width and height of each figure, by its file."""
 
 
 def main() -> None:
-    """Draw all pictures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=PICTURES, help="default: that of docs")
-    folder = parser.parse_args().folder
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "overview.webp").write_bytes(webp(png(overview_figure())))
-    for name, picture in {**{name: png(draw()) for name, draw in FIGURES.items()}, **pictures_of_demo()}.items():
-        (folder / f"{name}.png").write_bytes(few_colours(picture))
+    """Draw all pictures into docs."""
+    for name, content in ({name: png(drawn(*figure)) for name, figure in FIGURES.items()} | pictures_of_demo()).items():
+        (PICTURES / name).write_bytes(webp(content) if name.endswith("webp") else few_colours(content))
 
 
 if __name__ == "__main__":

@@ -11,12 +11,12 @@ from jaxtyping import Float, Int64, UInt8
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, slice_count
 from polarnet.networks.e2p.network import MOSAIC
-from polarnet.recordings.formats.aedat3 import PACKET
+from polarnet.recordings.formats import aedat3, celex5
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
-from studies.celex5_writer import write_celex5_bin, write_celex5_csv
-from studies.rosbag_writer import array_bytes, write_arrays, write_packets
+from studies.celex5_writer import write_celex5_bin
+from studies.rosbag_writer import ARRAY, PACKET, array_bytes, packet_bytes, write_bag
 
 PACKET_EVENTS = 10_000
 TEXT_LINES = 1_000_000  # formatted at a time
@@ -38,7 +38,7 @@ def parts_of(events: Events, size: int) -> Iterator[list[np.ndarray]]:
         yield columns_of(slice_count(events, start, start + size))
 
 
-def binary(header: str, content_of: Callable[..., bytes], size: int = TEXT_LINES) -> Writer:
+def binary(header: str, content_of: Callable[..., Any], size: int = TEXT_LINES) -> Writer:
     """A writer of a header, with {height} and {width}, and of the bytes of the columns, `size` events at a time."""
 
     def write(path: Path, events: Events) -> None:
@@ -49,10 +49,20 @@ def binary(header: str, content_of: Callable[..., bytes], size: int = TEXT_LINES
     return write
 
 
+def separated(*columns: np.ndarray, by: str = ",") -> bytes:
+    """Lines of whole numbers."""
+    return lines_of(np.stack(columns, axis=1), by)
+
+
 def evt2(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Words of 32 bits."""
     words = np.stack([8 << 28 | t >> 6, p << 28 | (t & 63) << 22 | x << 11 | y], axis=1)
     return words[np.stack([np.diff(t >> 6, prepend=-1) != 0, t >= 0], axis=1)].astype("<u4")
+
+
+def evt21(*columns: np.ndarray) -> np.ndarray:
+    """Words of 64 bits, whose lower half says which of 32 pixels from x on have the event: the first."""
+    return evt2(*columns).astype("<u8") << np.uint64(32) | np.uint64(1)
 
 
 def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
@@ -65,7 +75,7 @@ def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
 def aedat3_packet(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
     """A packet of AEDAT 3.1."""
     entries = np.stack([x << 17 | y << 2 | p << 1 | 1, t], axis=1).astype("<u4")
-    return PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
+    return aedat3.PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
 
 
 def write_aedat2(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], frames: UInt8[np.ndarray, "n h w"]) -> None:
@@ -138,13 +148,11 @@ def table_writer(name: str) -> Writer:
         with h5py.File(path, "w") as file:
             file.attrs["height"], file.attrs["width"] = events.height, events.width
             for table, fields in tables.items():
-                if None in fields:
-                    content = fields[None]
-                elif 0 in fields:
+                if 0 in fields:
                     content = np.stack([fields[k] for k in range(len(fields))], axis=1)
                 else:
                     kinds_of = [(field, column.dtype) for field, column in fields.items()]
-                    content = np.rec.fromarrays([*fields.values()], dtype=kinds_of)
+                    content = fields[None] if None in fields else np.rec.fromarrays([*fields.values()], dtype=kinds_of)
                 file.create_dataset(table, data=content, chunks=True)
 
     return write
@@ -160,53 +168,42 @@ def with_faery(path: Path, events: Events) -> None:
     faery.events_stream_from_array(rows, (events.width, events.height)).to_file(path)
 
 
-def messages(write: Callable[..., object], content_of: Callable[..., Any]) -> Writer:
+def messages(content_of: Callable[..., bytes], kind: str, plugin: str | None) -> Writer:
     """A writer of a bag with a message for every `PACKET_EVENTS` events."""
 
-    def write_bag(path: Path, events: Events) -> None:
+    def write(path: Path, events: Events) -> None:
         contents = itertools.starmap(content_of, parts_of(events, PACKET_EVENTS))
-        write(path, events.height, events.width, contents)
+        write_bag(path, events.height, events.width, contents, kind=kind, plugin=plugin)
 
-    return write_bag
+    return write
 
 
 PROPHESEE = "% evt {v}\n% format EVT{v};endianness=little;height={{height}};width={{width}}\n% end\n"
+DAT = "% Version 2\n% Height {height}\n% Width {width}\n\x0c\x08"
 AEDAT3 = "#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: DAVIS{width}\r\n#!END-HEADER\r\n"
 FILES: dict[str, tuple[str, Writer]] = {
     **{name: (".h5", table_writer(name)) for name in LAYOUTS},
     "dsec of polarnet": (".h5", write_hdf5),
-    "rosbag": (".bag", messages(write_arrays, array_bytes)),
-    "rosbag of EventPacket": ("", messages(write_packets, lambda *columns: ("evt3", 0, evt3(*columns)))),
+    "rosbag": (".bag", messages(array_bytes, ARRAY, None)),
+    "rosbag of EventPacket": ("", messages(lambda *columns: packet_bytes("evt3", 0, evt3(*columns)), PACKET, "MCAP")),
     "aedat4": (".aedat4", with_faery),
     "aedat3": (".aedat", binary(AEDAT3, aedat3_packet, PACKET_EVENTS)),
     "aedat2": (".aedat", lambda path, events: write_aedat2(path, events, NO_TIMES, NO_FRAMES)),
     "event_stream": (".es", with_faery),
     "evt": (".raw", binary(PROPHESEE.format(v="3.0"), evt3)),
-    "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), lambda *columns: evt2(*columns).tobytes())),
-    "evt 2.1": (
-        ".raw",
-        binary(
-            PROPHESEE.format(v="2.1"),
-            lambda *columns: (evt2(*columns).astype("<u8") << np.uint64(32) | np.uint64(1)).tobytes(),
-        ),
-    ),
-    "dat": (
-        ".dat",
-        binary(
-            "% Version 2\n% Height {height}\n% Width {width}\n\x0c\x08",
-            lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4").tobytes(),
-        ),
-    ),
+    "evt 2": (".raw", binary(PROPHESEE.format(v="2.0"), evt2)),
+    "evt 2.1": (".raw", binary(PROPHESEE.format(v="2.1"), evt21)),
+    "dat": (".dat", binary(DAT, lambda t, x, y, p: np.stack([t, x | y << 14 | p << 28], axis=1).astype("<u4"))),
     "text": (".txt", write_text),
-    "text of microseconds": (
-        ".txt",
-        binary("{width} {height}\n", lambda *columns: lines_of(np.stack(columns, axis=1), " ")),
-    ),
+    "text of microseconds": (".txt", binary("{width} {height}\n", lambda *columns: separated(*columns, by=" "))),
     "text, CSV of Prophesee": (
         ".csv",
-        binary("%geometry:{width},{height}\n", lambda t, x, y, p: lines_of(np.stack([x, y, p, t], axis=1), ",")),
+        binary("%geometry:{width},{height}\n", lambda t, x, y, p: separated(x, y, p, t)),
     ),
-    "celex5_csv": (".csv", write_celex5_csv),
+    "celex5_csv": (
+        ".csv",
+        binary("", lambda t, x, y, p: separated(y, x, np.full_like(t, celex5.WHITE // 2), 2 * p - 1, t)),
+    ),
     "celex5_bin": (".bin", write_celex5_bin),
 }
 """Suffix and writer of each format, and of further kinds of files whose first word is the format."""

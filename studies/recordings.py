@@ -1,4 +1,4 @@
-"""Speed and memory of recordings: python -m studies.recordings [--write] [--sections NAME ...]
+"""Speed and memory of recordings: python -m studies.recordings [--write] [--only NAME ...]
 
 Sections of docs/results/recordings.json, each measured in processes of their own:
 
@@ -12,8 +12,6 @@ Sections of docs/results/recordings.json, each measured in processes of their ow
 """
 
 import argparse
-import functools
-import json
 import os
 import re
 import tempfile
@@ -30,14 +28,7 @@ from polarnet.events.stream import Events, concatenate
 from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.writers import FORMS
 from studies.recording_files import FILES
-from studies.study import (
-    arguments_of,
-    command_line,
-    in_own_process,
-    machine_record,
-    outcomes,
-    write_section,
-)
+from studies.study import command_line, in_own_process, measure_sections, outcomes
 
 COUNT, SMALL = 10_000_000, 20_000  # events; the small file compiles every kernel
 PART = 1_000_000  # events that are made at a time, and microseconds that they take
@@ -138,21 +129,14 @@ def peak_of_array(path: str) -> float:
     return round(peak_mib(), 1)
 
 
-def measured(task: str, about: str) -> Any:
-    """Result of a task of `ONE` in a process of its own."""
-    figure = in_own_process("studies.recordings", "--one", task, about)
-    print(task, about, figure, flush=True)
-    return figure
-
-
-def measure_readers() -> tuple[dict[str, Any], dict[str, Any]]:
+def measure_readers(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """Speed of the readers and writers."""
-    files = {name: measured("reader", name) for name in FILES}
-    writers = {form: measured("writer", form) for form in FORMS}
+    files = {name: in_own_process(speed_of_reader, name) for name in FILES}
+    writers = {form: in_own_process(speed_of_writer, form) for form in FORMS}
     return {"files": files, "writers": writers}, {"readers_mev_per_cpu_s": {n: one["read"] for n, one in files.items()}}
 
 
-def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
+def measure_memory(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """Peak memory of the commands, and bytes an event of an array."""
     rows: dict[str, dict[str, int]] = {}
     arrays = {}
@@ -163,7 +147,8 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, f"recording{suffix}")
                 write(path, parts(size, *MEMORY_SENSOR))
-                peaks[size] = {name: measured(name, str(path)) for name in (*COMMANDS, "array")}
+                peaks[size] = {name: in_own_process(peak_of_command, name, str(path)) for name in COMMANDS}
+                peaks[size]["array"] = in_own_process(peak_of_array, str(path))
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
         few, many = MEMORY_SIZES[1:3]
@@ -171,10 +156,10 @@ def measure_memory() -> tuple[dict[str, Any], dict[str, Any]]:
     return {"commands": rows, "bytes_per_event": arrays}, {"bytes_per_event_max": max(arrays.values())}
 
 
-def measure_cases() -> tuple[dict[str, Any], dict[str, Any]]:
+def measure_cases(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """The table of the reference cases, and what their tests see now."""
     if "POLARNET_SHARED" not in os.environ:
-        raise SystemExit("--sections cases: set POLARNET_SHARED to the folder with cases/recordings")
+        raise SystemExit("--only cases: set POLARNET_SHARED to the folder with cases/recordings")
     tests = outcomes("tests/recordings/test_cases.py")
     text = Path(os.environ["POLARNET_SHARED"], "cases", "recordings", "README.md").read_text(encoding="utf-8")
     table = []
@@ -207,33 +192,8 @@ def one_line(seen: Mapping[str, str]) -> str:
     return "<br>".join(f"`{', '.join(names)}`: {what}" for what, names in files.items())
 
 
-ONE: dict[str, Callable[[str], Any]] = {
-    "reader": speed_of_reader,
-    "writer": speed_of_writer,
-    "array": peak_of_array,
-    **{name: functools.partial(peak_of_command, name) for name in COMMANDS},
-}
-
-
 SECTIONS = {"readers": measure_readers, "memory": measure_memory, "cases": measure_cases}
 
-
-def main() -> None:
-    """The command line."""
-    parser = command_line(__doc__, "docs/results/recordings.json")
-    parser.add_argument("--sections", nargs="*", choices=SECTIONS, default=SECTIONS)
-    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
-    arguments = arguments_of(parser)
-    if arguments.one:
-        task, about = arguments.one
-        print(json.dumps(ONE[task](about)))
-        return
-    for section in arguments.sections:
-        record = machine_record()
-        figures, headlines = SECTIONS[section]()
-        if arguments.write:
-            write_section("recordings", section, figures, record, headlines)
-
-
 if __name__ == "__main__":
-    main()
+    sections = {name: ("recordings", name, measure) for name, measure in SECTIONS.items()}
+    measure_sections(command_line(__doc__, "docs/results/recordings.json"), sections)

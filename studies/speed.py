@@ -1,9 +1,9 @@
-"""Speed of the network, the emulator and recovery: python -m studies.speed [--only network|simulation|live] [--write]
+"""Speed of the network, the emulator and recovery: python -m studies.speed [--only NAME ...] [--write]
 
 - network: windows a second on random points that move, for each size of sensor, many at once as in a file and one by
   one as from a camera, with and without blocks of 2x2 pixels (`methods.ours.binning=2`). --write:
   docs/results/robustness.json, section speed.
-- network with --before CHECKOUT: the same of an older checkout of this repository, in turns with this one, and the
+- turns, with --before CHECKOUT: `measure_network` of an older checkout, in turns with this one's, and
   ratios of the medians. --write: docs/results/speed.json, section turns, and speedup_HEIGHTxWIDTH of files and cameras.
 - simulation: events of one drifting sensor (`studies.simulation_run`). Times are medians of wall-clock time. Every
   model and number of threads runs in its own process; the processes take turns, so that other load affects all of them
@@ -14,16 +14,12 @@
   third of the time. --write: docs/results/speed.json.
 """
 
-import argparse
-import json
-import os
 import re
 import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +35,8 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
-from studies.study import ROOT, arguments_of, command_line, in_own_process, machine_record, write_section
+from studies.simulation_run import timed_run
+from studies.study import ROOT, Measurement, command_line, in_own_process, measure_sections
 
 SIZES = ((120, 180), (260, 346), (480, 640))
 RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
@@ -110,10 +107,7 @@ def measure_turns(before: Path, threads: int) -> tuple[dict[str, Any], dict[str,
     turns: dict[Path, list[dict[str, Any]]] = {before: [], ROOT: []}
     for number in range(ROUNDS):
         for root in list(turns)[:: (-1) ** number]:
-            environment = {**os.environ, "PYTHONPATH": str(root)}
-            command = [sys.executable, __file__, "--sizes", str(threads)]
-            done = subprocess.run(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-            turns[root].append(json.loads(done.stdout.splitlines()[-1])["sizes"])
+            turns[root].append(in_own_process(measure_network, threads, root=root)["sizes"])
 
     def medians(root: Path, size: str) -> dict[str, float]:
         return {kind: float(np.median([sizes[size]["pixels"][kind] for sizes in turns[root]])) for kind in KINDS}
@@ -132,7 +126,7 @@ def measure_models() -> dict[str, dict[str, Any]]:
     runs: dict[tuple[str, int], list[dict[str, Any]]] = {(model, t): [] for model in MODELS for t in THREADS}
     for _ in range(ROUNDS):
         for model, threads in runs:
-            runs[model, threads].append(in_own_process("studies.simulation_run", model, threads))
+            runs[model, threads].append(in_own_process(timed_run, model, threads))
     seconds = {key: float(np.median([s for one in of_key for s in one["seconds"]])) for key, of_key in runs.items()}
     return {
         model: {
@@ -224,28 +218,16 @@ def feed(live: subprocess.Popen, size: tuple[int, int], tails: np.ndarray, secon
 def main() -> None:
     """Measure, print and perhaps write."""
     parser = command_line(__doc__, "docs/results/robustness.json, emulation.json and speed.json")
-    parser.add_argument("--only", choices=("network", "simulation", "live"))
     parser.add_argument("--seconds", type=int, default=60, help="of live input")
     parser.add_argument("--threads", type=int, default=usable_cores(), help="of the network")
-    parser.add_argument("--before", type=Path, help="older checkout, measured in turns with this one")
-    parser.add_argument("--sizes", help=argparse.SUPPRESS)
-    arguments = arguments_of(parser)
-    if arguments.sizes:
-        print(json.dumps(measure_network(int(arguments.sizes))))
-        return
-    studies: dict[str, tuple[str, str, Callable[[], tuple[dict[str, Any], dict[str, Any]]]]] = {
-        "network": ("robustness", "speed", lambda: (measure_network(arguments.threads), {})),
-        "simulation": ("emulation", "models", lambda: (measure_models(), {})),
-        "live": ("speed", "live", lambda: measure_live(arguments.seconds)),
+    parser.add_argument("--before", type=Path, default=ROOT, help="older checkout for turns")
+    sections: dict[str, tuple[str, str, Measurement]] = {
+        "network": ("robustness", "speed", lambda given: (measure_network(given.threads), {})),
+        "simulation": ("emulation", "models", lambda _: (measure_models(), {})),
+        "live": ("speed", "live", lambda given: measure_live(given.seconds)),
+        "turns": ("speed", "turns", lambda given: measure_turns(given.before, given.threads)),
     }
-    if arguments.before:
-        studies = {"network": ("speed", "turns", lambda: measure_turns(arguments.before, arguments.threads))}
-    for kind, (name, section, measure) in studies.items():
-        if arguments.only in (None, kind):
-            record, (figures, headlines) = machine_record(), measure()
-            print(json.dumps(figures, indent=1), flush=True)
-            if arguments.write:
-                write_section(name, section, figures, record, headlines)
+    measure_sections(parser, sections, default=("network", "simulation", "live"))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -23,6 +23,8 @@ PICTURES = ROOT / "docs" / "pictures"
 VERSIONS_OF = ("torch", "numpy", "numba", "zarr", "dvc", "hydra-core")
 MEASURED = ("docs/results", "docs/pictures", "dvc.lock", "data/benchmark/metrics.json")
 """Files that measurements write, so that they may differ from the commit that a figure names."""
+Measurement = Callable[[argparse.Namespace], tuple[Mapping[str, Any], Mapping[str, Any]]]
+"""Figures of a section, and headlines above the sections of its file, for the arguments of the command line."""
 
 
 def machine_record() -> dict[str, Any]:
@@ -63,12 +65,35 @@ def arguments_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
     return arguments
 
 
-def in_own_process(module: str, *words: object) -> Any:
-    """What `python -m MODULE WORDS` prints as JSON in its last line; RuntimeError with its messages if it fails."""
-    command = [sys.executable, "-m", module, *map(str, words)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+def measure_sections(
+    parser: argparse.ArgumentParser, sections: Mapping[str, tuple[str, str, Measurement]], default: Iterable[str] = ()
+) -> None:
+    """Measure what `--only` names (`default`, or all), print it, and with `--write` keep it.
+
+    `sections` has the file of docs/results, its section and the measurement by name.
+    """
+    chosen = [*default] or [*sections]
+    parser.add_argument("--only", nargs="+", choices=sections, default=chosen, help=f"default: {' '.join(chosen)}")
+    arguments = arguments_of(parser)
+    for name in arguments.only:
+        file, section, measure = sections[name]
+        record, (figures, headlines) = machine_record(), measure(arguments)
+        print(name, json.dumps(figures, indent=1), flush=True)
+        if arguments.write:
+            write_section(file, section, figures, record, headlines)
+
+
+def in_own_process(function: Callable[..., Any], *arguments: str | int, root: Path = ROOT) -> Any:
+    """Print and return the result, as JSON, of a function of a module in a process of its own.
+
+    `root` is the checkout whose modules the process imports. RuntimeError with the messages of a process that fails.
+    """
+    module, name = function.__globals__["__spec__"].name, function.__name__
+    code = f"import json; from {module} import {name}; print(json.dumps({name}(*{arguments})))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
     if done.returncode:
-        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+        raise RuntimeError(f"{name}{arguments} failed:\n{done.stderr[-2000:]}")
+    print(f"{name}{arguments}", done.stdout.splitlines()[-1], flush=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -18,15 +18,11 @@ from polarnet.simulation.motion import render
 from polarnet.simulation.scene import scene_from_rgb
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from studies.simulated_rig import RigConfig, write_rig
+from studies.simulated_rig import PICTURE_RATE_HZ, RigConfig, write_rig
 
-PICTURE_RATE_HZ = 60.0
 SMALL = {"enabled": True, "sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96],
          "size": [16, 24]}  # fmt: skip
-RIG = RigConfig(
-    speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=PICTURE_RATE_HZ,
-    full_well_electrons=20000.0, read_noise=2.0, hot_pixels=3,
-)  # fmt: skip
+RIG = RigConfig(speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, hot_pixels=3)
 
 
 def true_dolp(truth, t_us, recordings):

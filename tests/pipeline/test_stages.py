@@ -92,10 +92,7 @@ def test_the_benchmark_has_a_row_for_every_method_with_lpips_and_says_of_which_b
     assert metrics["oracle_mean"]["mse"] <= min(metrics["zeros"]["mse"], metrics["train_mean"]["mse"])
 
 
-RIG = RigConfig(
-    speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, picture_rate_hz=60.0, full_well_electrons=20000.0,
-    read_noise=2.0, hot_pixels=3,
-)  # fmt: skip
+RIG = RigConfig(speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, hot_pixels=3)
 RIG_SIZE = {"sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96], "size": [16, 24]}
 
 

@@ -15,7 +15,7 @@ from polarnet.recordings.noise import Cleaner, Cleaning, hot_pixels, never, read
 from polarnet.recordings.recording import open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.stokes import parse_mosaic
-from studies.celex5_writer import write_celex5_csv
+from studies.recording_files import FILES
 
 
 def test_the_picture_is_of_the_events_that_took_the_least_time_and_of_no_huge_sensor(tmp_path, columns):
@@ -59,7 +59,7 @@ def test_inspect_prints_findings_and_draws_no_hot_pixels(tmp_path, make_events, 
     monkeypatch.chdir(tmp_path)
     edge = make_events([(k, k % 50, 20, 1 - 2 * (k % 2)) for k in range(100)], 800, 1280)
     hot = make_events([(k, 700, 300, 1) for k in range(100)], 800, 1280)
-    write_celex5_csv(tmp_path / "capture.csv", merge([edge, hot]))
+    FILES["celex5_csv"][1](tmp_path / "capture.csv", merge([edge, hot]))
     assert main(["inspect", "capture.csv"]) == 0
     printed = capsys.readouterr().out
     assert "hot pixels  1 with 50.0% of the events (x 700 y 300: 100)" in printed

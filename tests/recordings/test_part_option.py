@@ -10,7 +10,7 @@ from polarnet.recordings.recording import read_recording
 
 pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
 
-from studies.rosbag_writer import write_bag
+from studies.rosbag_writer import two_arrays, write_bag
 
 COMMANDS = {
     "inspect": ("--out", "out"),
@@ -27,8 +27,8 @@ def folder(tmp_path, monkeypatch):
     """A bag of two topics, and the folder of a ROS 2 bag with one; both hold 400 events in 40 ms."""
     monkeypatch.chdir(tmp_path)
     rows = [(100 * k, k % 18, k * 7 % 12, 1 - 2 * (k % 2)) for k in range(400)]
-    write_bag(tmp_path / "two.bag", rows, 12, 18, ("/left", "/right"))
-    write_bag(tmp_path / "one", rows, 12, 18, form="ros2")
+    write_bag(tmp_path / "two.bag", 12, 18, two_arrays(rows), ("/left", "/right"))
+    write_bag(tmp_path / "one", 12, 18, two_arrays(rows), plugin="SQLITE3")
     return tmp_path
 
 

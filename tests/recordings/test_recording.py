@@ -11,7 +11,6 @@ from polarnet.recordings.recording import open_recording, read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import write_evt3, write_hdf5, write_text
 from polarnet.stokes import parse_mosaic
-from studies.celex5_writer import write_celex5_csv
 from studies.recording_files import FILES
 
 SAMPLES = {
@@ -44,7 +43,7 @@ def test_a_dat_sample_is_read_once_the_size_of_the_sensor_is_given(shared):
 @pytest.mark.parametrize("size", [1, 7, 999, 1000, 10**6])
 def test_chunks_hold_the_same_events_whatever_their_size(tmp_path, make_random_events, size):
     events = make_random_events(0, 1000, 10**6)
-    write_celex5_csv(tmp_path / "e.csv", events)
+    FILES["celex5_csv"][1](tmp_path / "e.csv", events)
     chunks = list(open_recording(tmp_path / "e.csv").chunks(size))
     assert {len(chunk) for chunk in chunks[:-1]} <= {size}
     assert 0 < len(chunks[-1]) <= size
@@ -141,14 +140,14 @@ def test_four_files_in_any_order_or_one_mosaic_become_the_four_channels(tmp_path
     events = {angle: make_random_events(angle, 200, 60_000) for angle in (90, 0, 135, 45)}
     files = {angle: tmp_path / f"camera_{k}.csv" for k, angle in enumerate(events)}
     for angle, path in files.items():
-        write_celex5_csv(path, events[angle])
+        FILES["celex5_csv"][1](path, events[angle])
     first = min(int(e.t[0]) for e in events.values())
     channels = read_four({-45 if angle == 135 else angle: path for angle, path in files.items()})
     for angle, channel in zip(ANGLES, channels, strict=True):
         assert torch.equal(channel.t, events[angle].t - first)
         assert torch.equal(channel.x, events[angle].x)
     events = make_random_events(1, 200, 60_000)
-    write_celex5_csv(tmp_path / "a.csv", events)
+    FILES["celex5_csv"][1](tmp_path / "a.csv", events)
     channels = read_mosaic(tmp_path / "a.csv", parse_mosaic("90 45 / 135 0"))
     assert min(int(c.t[0]) for c in channels) == 0
     assert sum(map(len, channels)) == len(events)

@@ -22,7 +22,7 @@ chosen:
 without:
   file: speed
   rows: models
-  without: {n: 1200}
+  without: [n, 1200]
   columns: {model: "{name}"}
   caption: ""
 """
@@ -86,7 +86,7 @@ def test_a_block_that_is_open_or_unknown_is_an_error(project, text, error):
 def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_root, project):
     pages = "".join(page.read_text() for page in [project_root / "README.md", *(project_root / "docs").glob("*.md")])
     for name, table in read_tables(project_root).items():
-        text = block_text(table, read_file(project_root, table["file"]))
+        text = block_text(table, read_file(project_root, table.file))
         assert "Not measured" not in text, name
         assert any(digit in text for digit in "123456789"), name
         assert f"<!-- results:{name} -->" in pages
@@ -94,7 +94,7 @@ def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_
         "machines": [{"letter": "A", "machine": "Xeon", "cores": 2, "units": None, "versions": "torch 2.13.0"}],
         "measured": {"speed": "models: A, load 0.5, `0123456789`"},
     }
-    listed = read_tables(project_root)["records"]["rows"].values()
+    listed = read_tables(project_root)["records"].rows.values()
     assert sorted(listed) == list(read_file(project_root, "records")["measured"])
 
 
@@ -109,7 +109,7 @@ def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_
 def test_the_best_method_and_constant_of_the_readme_are_the_best(project_root, scenes, method, constant):
     """The block `abilities` of docs/tables.yaml names them; the oracle mean needs the truth and is neither."""
     rows = read_file(project_root, "robustness")["test"]["tables"][scenes]["rows"]
-    block = read_tables(project_root)["abilities"]["caption"]
+    block = read_tables(project_root)["abilities"].caption
     for best, others in ((method, ("highpass+gain", "firenet_published+gain")), (constant, CONSTANTS)):
         assert min(others, key=lambda row: rows[row]["mse"]) == best
         assert f"{{test[tables][{scenes}][rows][{best}][mse]:rms.2f}}" in block

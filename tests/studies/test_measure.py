@@ -73,8 +73,8 @@ def test_a_release_measures_what_another_commit_measured_and_counts_its_tables(p
     monkeypatch.setattr(measure, "download_mb", lambda *requirements: 550)
     monkeypatch.setattr(measure.subprocess, "run", lambda command, **_: commands.append(command[1:]))
     path = measure.measure_release(project, project, ["camera", "speed", "light"])
-    assert commands == [["-m", "studies.light", "--write"]]
-    assert "light, dolp: python -m studies.light" in capsys.readouterr().out
+    assert commands == [["-m", "studies.camera", "--only", "events", "dolp", "--write"]]
+    assert "light, dolp: python -m studies.camera" in capsys.readouterr().out
     figures = json.loads(path.read_text())
     del figures["records"], figures["release"]
     assert figures == {

@@ -7,7 +7,7 @@ import pytest
 
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from studies.rosbag_writer import write_bag, write_packets
+from studies.rosbag_writer import PACKET, packet_bytes, two_arrays, write_bag
 
 EVENTS = [(5, 3, 4, 1), (1_000_009, 7, 0, -1), (1_000_010, 0, 5, 1)]
 
@@ -17,22 +17,24 @@ def rosbags():
     return pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
 
 
-def write(path, topics=("/dvs/events",), form="ros1", package="dvs_msgs"):
-    write_bag(path, EVENTS, 6, 8, topics, form, package)
+def write(path, topics=("/dvs/events",), package="dvs_msgs", plugin=None):
+    write_bag(path, 6, 8, two_arrays(EVENTS), topics, f"{package}/msg/EventArray", plugin)
     return path
 
 
-@pytest.mark.parametrize(("form", "package"), [("ros1", "dvs_msgs"), ("ros2", "prophesee_event_msgs")])
-def test_events_of_a_bag_arrive_in_microseconds_with_the_sensors_size(rosbags, tmp_path, read, form, package):
-    path = write(tmp_path / ("e.bag" if form == "ros1" else "e"), form=form, package=package)
+@pytest.mark.parametrize(
+    ("name", "package", "plugin"), [("e.bag", "dvs_msgs", None), ("e", "prophesee_event_msgs", "SQLITE3")]
+)
+def test_events_of_a_bag_arrive_in_microseconds_with_the_sensors_size(rosbags, tmp_path, read, name, package, plugin):
+    path = write(tmp_path / name, package=package, plugin=plugin)
     assert read(path) == (("rosbag", 6, 8), np.array(EVENTS).T.tolist(), {"pauses": 1})
 
 
-@pytest.mark.parametrize("plugin", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
 def test_a_file_of_a_bag_of_ros_2_is_read_alone(rosbags, tmp_path, read, plugin, count):
     rows = [(10 * k, k % 8, k % 6, 1 - 2 * (k % 3 == 0)) for k in range(count)]
-    write_bag(tmp_path / "e", rows, 6, 8, form="ros2", plugin=plugin)
+    write_bag(tmp_path / "e", 6, 8, two_arrays(rows), plugin=plugin)
     (path,) = [path for path in (tmp_path / "e").iterdir() if path.suffix in (".db3", ".mcap")]
     assert read(path) == (("rosbag", 6, 8), np.array(rows).T.tolist(), {})
 
@@ -63,12 +65,14 @@ PACKETS = {
 @pytest.mark.parametrize("encoding", PACKETS)
 def test_packets_of_event_camera_msgs_worked_out_by_hand(rosbags, tmp_path, read, encoding):
     packets, columns = PACKETS[encoding]
-    write_packets(tmp_path / "e", 8, 10, [(encoding, base, words.tobytes()) for base, words in packets])
+    contents = [packet_bytes(encoding, base, words.tobytes()) for base, words in packets]
+    write_bag(tmp_path / "e", 8, 10, contents, kind=PACKET, plugin="MCAP")
     assert read(tmp_path / "e") == (("rosbag", 8, 10), columns, {})
 
 
 def test_packets_of_another_encoding_are_refused(rosbags, tmp_path):
-    write_packets(tmp_path / "e", 8, 10, [("evt3", 0, bytes(4)), ("trigger", 0, bytes(8))])
+    contents = [packet_bytes("evt3", 0, bytes(4)), packet_bytes("trigger", 0, bytes(8))]
+    write_bag(tmp_path / "e", 8, 10, contents, kind=PACKET, plugin="MCAP")
     with pytest.raises(RecordingError, match=r"expected packets of one encoding of evt3, .*, got 'trigger'"):
         read_recording(tmp_path / "e")
 
@@ -81,7 +85,7 @@ def test_a_bag_of_several_topics_needs_the_topic(rosbags, tmp_path):
     with pytest.raises(
         RecordingError, match=r"expected a topic of EventArray .* got only /e \(other_msgs/msg/EventArray\)"
     ):
-        read_recording(write(tmp_path / "e", ("/e",), "ros2", "other_msgs"))
+        read_recording(write(tmp_path / "e", ("/e",), "other_msgs", "SQLITE3"))
 
 
 def test_a_damaged_bag_is_refused(rosbags, tmp_path):
