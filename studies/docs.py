@@ -143,7 +143,7 @@ def rows_of(rows: str | Mapping[str, str], results: Results) -> Iterator[dict[st
 
 
 def markdown(columns: Mapping[str, str], rows: list[dict[str, Any]], results: Results) -> str:
-    """A GitHub table with numbers aligned to the right; text and the first column, which names the rows, to the left."""
+    """A GitHub table: numbers to the right, text and the names of the rows (the first column) to the left."""
     cells = [[_cell(form, row, results) for form in columns.values()] for row in rows]
     numeric = [k > 0 and all(row[k][:1] in "+-0123456789" for row in cells) for k in range(len(columns))]
     rule = "|".join("---:" if right else "---" for right in numeric)
