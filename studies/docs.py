@@ -126,9 +126,10 @@ def rows_of(table: Table, results: Results) -> Iterator[dict[str, Any]]:
 
 
 def markdown(table: Table, results: Results) -> str:
-    """A GitHub table with numbers aligned to the right and text to the left."""
+    """A GitHub table: numbers to the right, text and the names of the rows (the first column) to the left."""
     cells = [[_cell(form, row, results) for form in table.columns.values()] for row in rows_of(table, results)]
     numeric = [all(cell[:1] in "+-0123456789" for cell in column) for column in zip(*cells, strict=True)]
+    numeric[:1] = [False]
     rule = "|".join("---:" if right else "---" for right in numeric)
     return "\n".join([f"| {' | '.join(table.columns)} |", f"|{rule}|", *(f"| {' | '.join(row)} |" for row in cells)])
 

@@ -250,7 +250,7 @@ METHODS = (
     Method(
         name="registered",
         label="ours, registered",
-        colour="#a61e4d",
+        colour="#be4bdb",
         open=open_registered,
         networks=("polarnet",),
         shipped=True,

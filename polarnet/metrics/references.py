@@ -55,8 +55,8 @@ REFERENCES = {
         Reference(
             "oracle_mean",
             "oracle mean",
-            "Each true frame's own mean, the best constant there is. It looks at the truth, so it is no method; what "
-            "does not beat it shows little spatial skill in MSE.",
+            "Each true frame's own mean. It looks at the truth, so it is no method; what does not beat it shows little "
+            "spatial skill in MSE.",
             oracle_mean,
         ),
     )

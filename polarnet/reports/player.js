@@ -59,6 +59,7 @@ class Player {
     this.cursor = null;
     this.view = { zoom: 1, x: 50, y: 50 };
     option(this.find("scene"), this.scenes.map((scene) => scene.name), 0);
+    this.find("scene").parentElement.hidden = this.scenes.length < 2;
     this.listen();
     this.show(0);
   }

@@ -28,7 +28,7 @@ class Column:
 
     def printed(self, value: float | int) -> str:
         """A value with the decimals of its column; a value that rounds to 0 has no sign."""
-        return f"{value:z.{self.decimals}f}"
+        return f"{value:z,.{self.decimals}f}"
 
 
 COLUMNS: Mapping[str, Column] = {

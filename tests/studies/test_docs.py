@@ -16,7 +16,7 @@ speed:
 chosen:
   file: speed
   section: models
-  rows: {the best: a}
+  rows: {2 seeds: a}
   columns: {"": "{label}", MSE: "{models[$name][mse]:.1f}"}
   caption: ""
 without:
@@ -52,7 +52,7 @@ def test_a_table_has_a_row_for_each_entry_or_those_chosen_and_its_caption_names_
         "2 models. Commit `0123456789`.",
     ]
     text = block_text(read_tables(project)["chosen"], read_file(project, "speed"))
-    assert text == "|  | MSE |\n|---|---:|\n| the best | 0.0 |"
+    assert text == "|  | MSE |\n|---|---:|\n| 2 seeds | 0.0 |"
     assert block_text(read_tables(project)["speed"], {}).startswith("Not measured yet")
     assert block_text(read_tables(project)["without"], read_file(project, "speed")).splitlines()[2:] == ["| b |"]
 
