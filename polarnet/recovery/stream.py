@@ -49,7 +49,7 @@ SCORES = {
     "ssim": "SSIM {:.3f}",
     "corr": "correlation {:.3f}",
     "aolp_deg": "AoLP error {:.1f} degrees",
-    "oracle_mse": "MSE of each frame's true mean alone {:.4f}",
+    "oracle_mse": "MSE of the true mean of each frame alone {:.4f}",
 }
 
 

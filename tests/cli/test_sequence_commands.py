@@ -42,7 +42,7 @@ def test_truth_scores_a_recovery_and_reaches_its_video(simulated, tmp_path, caps
     printed = capsys.readouterr().out
     assert "scores      MSE 0." in printed
     assert "AoLP error" in printed
-    assert "MSE of each frame's true mean alone 0." in printed
+    assert "MSE of the true mean of each frame alone 0." in printed
     with av.open(str(tmp_path / "out" / "recovered.mp4")) as file:
         assert next(file.decode(video=0)).width > 700  # three columns of panels
     (tmp_path / "e.txt").write_text("4 4\n1 2 3 1\n")
