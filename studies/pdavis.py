@@ -59,14 +59,16 @@ def simulate(folder: Path, polarizer_deg: int) -> Path:
     grey = read_rgb(next(one.path for one in BUILTIN_PHOTOS if one.path.stem == "astronaut")).mean(0)
     row, column = (torch.arange(side) // SQUARE % 2 for side in grey.shape)
     polarized = (row[:, None] == column) * TRUE_DOLP
-    pictures = []
+    pictures = folder / f"polarizer_{polarizer_deg}"
+    pictures.mkdir(parents=True, exist_ok=True)
     for angle in POLARIZER_ANGLES_DEG:
         light = grey * (1 + polarized * math.cos(2 * math.radians(angle - polarizer_deg))) / (1 + TRUE_DOLP)
-        pictures.append(folder / f"polarizer{polarizer_deg}_{angle}.png")
-        write_png(pictures[-1], np.repeat(light.numpy()[..., None], 3, axis=2).astype(np.float32), 16)
+        write_png(
+            pictures / f"astronaut_{angle}.png", np.repeat(light.numpy()[..., None], 3, axis=2).astype(np.float32), 16
+        )
     made = folder / f"simulated_{polarizer_deg}"
     size = ["synthesize.sensor_height=130", "synthesize.sensor_width=173", "synthesize.duration_s=2"]
-    if polarnet(["simulate", *map(str, pictures), "--out", str(made), "--no-preview", *size]):
+    if polarnet(["simulate", str(pictures), "--out", str(made), "--no-preview", *size]):
         raise SystemExit("polarnet simulate failed")
     return made
 
