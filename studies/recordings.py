@@ -183,7 +183,7 @@ def named(file: str, files: str) -> bool:
 
 
 def one_line(seen: Mapping[str, str]) -> str:
-    """What was seen of each file; files of which the same was seen stand together."""
+    """Findings by file in a line; files with the same findings stand together."""
     files: dict[str, list[str]] = {}
     for file, what in seen.items():
         files.setdefault(what, []).append(file)

@@ -31,7 +31,7 @@ from polarnet.config.pipeline import context_of
 from polarnet.events.representations import event_counts
 from polarnet.events.streaming import encode_windows
 from polarnet.methods.registration import Panorama, register, views
-from polarnet.metrics.offset import contrasts, dolp_of, offset_scores
+from polarnet.metrics.offset import atanh_stokes, dolp_of, offset_scores
 from polarnet.metrics.similarity import mse, spread_mse
 from polarnet.networks.weights import shipped_weights
 from polarnet.stokes import Prediction
@@ -57,7 +57,7 @@ def redundant_offset(panorama: Panorama) -> Float64[np.ndarray, " 2"]:
     return (constants[:2] - constants[2:]) / 2
 
 
-def panorama_contrasts(panorama: Panorama, size: tuple[int, int], first: int) -> Float32[np.ndarray, "2 k h w"]:
+def atanh_of_panorama(panorama: Panorama, size: tuple[int, int], first: int) -> Float32[np.ndarray, "2 k h w"]:
     """atanh(s1) and atanh(s2) at each time from the first scored one on, up to an offset each."""
     images = THRESHOLD * (panorama.images - panorama.images[:, panorama.seen].mean(1)[:, None, None])
     x, y = panorama.x[first:], panorama.y[first:]
@@ -85,7 +85,7 @@ def errors_of(test: TestSequence, first: int) -> dict[str, float]:
     size = (test.dolp.shape[-2], test.dolp.shape[-1])
     true_dolp, true_aolp = test.dolp[first:], test.aolp[first:]
     valid = torch.ones_like(true_dolp, dtype=torch.bool) if test.valid is None else test.valid[first:]
-    truth = contrasts(true_dolp, true_aolp).double().numpy().swapaxes(0, 1)
+    truth = atanh_stokes(true_dolp, true_aolp).double().numpy().swapaxes(0, 1)
     config = settings()
     ours = predictions_of([OURS], test, context_of(config, [OURS], 0.0, shipped_weights()))[OURS]
     ours = Prediction(ours.dolp[first:], None if ours.aolp is None else ours.aolp[first:])
@@ -94,7 +94,7 @@ def errors_of(test: TestSequence, first: int) -> dict[str, float]:
     polarity, number = counts[:, 0::2].transpose(1, 0, 2, 3), counts[:, 1::2].transpose(1, 0, 2, 3)
     panorama = register(np.stack([number + polarity, number - polarity], axis=1) / 2, config.methods.registration)
     assert panorama is not None, "the test scenes move"
-    found, seen = panorama_contrasts(panorama, size, first + 1), valid.numpy()
+    found, seen = atanh_of_panorama(panorama, size, first + 1), valid.numpy()
     true_offset = np.array([np.median((t - o)[seen]) for t, o in zip(truth, found, strict=True)])
 
     def mean_error(frames: Tensor) -> float:

@@ -301,7 +301,8 @@ def warmup_windows(config: Config) -> int:
 
 def table_of(scores: Scores) -> dict[str, Any]:
     """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
-    errors, psnr, offsets, left = (scene_means(scores.rows, name) for name in ("mse", "psnr", *OFFSET))
+    means = {name: scene_means(scores.rows, name) for name in ("mse", "psnr", *OFFSET)}
+    errors = means["mse"]
     oracle = errors["oracle_mean"]
     table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
     for row, of_scene in errors.items():
@@ -310,12 +311,8 @@ def table_of(scores: Scores) -> dict[str, Any]:
             "mse": mse,
             "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
-            "psnr": statistics.fmean(psnr[row].values()),
+            **{name: statistics.fmean(means[name][row].values()) for name in ("psnr", *OFFSET) if row in means[name]},
         }
-        if row in offsets:
-            table["rows"][row] |= {
-                name: statistics.fmean(of[row].values()) for name, of in zip(OFFSET, (offsets, left), strict=True)
-            }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
     return table

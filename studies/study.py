@@ -1,4 +1,4 @@
-"""What all studies share: the record of a measurement, docs/results/NAME.json, command lines, running stages."""
+"""Shared parts of all studies: the record of a measurement, docs/results/NAME.json, command lines, running stages."""
 
 import argparse
 import importlib.metadata
@@ -98,7 +98,7 @@ def in_own_process(function: Callable[..., Any], *arguments: str | int, root: Pa
 
 
 def outcomes(*tests: str) -> dict[str, dict[str, Any]]:
-    """Of each case of these tests, by its name: `passed`, which a skipped one has not, and the properties it recorded.
+    """Outcome of each case of these tests, by name: `passed`, which a skipped one has not, and what it recorded.
 
     Tests are named as pytest does.
     """

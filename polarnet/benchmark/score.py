@@ -21,7 +21,6 @@ from polarnet.metrics.similarity import (
     gradient_agreement,
     level_mse,
     pattern_mse,
-    spread_mse,
     with_truth_outside,
 )
 from polarnet.runtime.machine import generator_for
@@ -152,7 +151,6 @@ def score_sequence(
             "level_mse": level_mse(prediction.dolp, truth, valid),
             "pattern_mse": pattern_mse(prediction.dolp, truth, valid),
             **offset_scores(prediction, truth, aolp, valid),
-            "oracle_mse": spread_mse(truth, valid),
         }
         columns = [scores[name].tolist() if name in scores else [None] * len(windows) for name in SCORES]
         for window, *values in zip(windows, *columns, strict=True):

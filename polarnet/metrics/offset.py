@@ -9,31 +9,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from polarnet.metrics.similarity import mse
-from polarnet.stokes import Prediction
+from polarnet.stokes import Prediction, stokes_from_polarization
 
 MAX_DOLP = 0.98  # beyond it, atanh grows without bound: a pixel of DoLP 1 would outweigh all others
 
 
-def contrasts(dolp: Float[Tensor, "*b h w"], aolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b 2 h w"]:
+def atanh_stokes(dolp: Float[Tensor, "*b h w"], aolp: Float[Tensor, "*b h w"]) -> Float[Tensor, "*b 2 h w"]:
     """atanh(s1) and atanh(s2) from DoLP, reduced by the factor `MAX_DOLP`, and AoLP in radians."""
-    direction = torch.stack([torch.cos(2 * aolp), torch.sin(2 * aolp)], dim=-3)
-    return torch.atanh(MAX_DOLP * dolp[..., None, :, :] * direction)
+    vectors = stokes_from_polarization(torch.ones_like(dolp), MAX_DOLP * dolp, aolp)
+    return torch.atanh(vectors[..., 1:, :, :])
 
 
-def dolp_of(contrasts: Float[Tensor, "*b 2 h w"]) -> Float[Tensor, "*b h w"]:
-    """DoLP in [0, 1] from atanh(s1) and atanh(s2); undoes `contrasts`."""
-    s1, s2 = torch.tanh(contrasts).unbind(-3)
+def dolp_of(atanh: Float[Tensor, "*b 2 h w"]) -> Float[Tensor, "*b h w"]:
+    """DoLP in [0, 1] from atanh(s1) and atanh(s2); undoes `atanh_stokes`."""
+    s1, s2 = torch.tanh(atanh).unbind(-3)
     return (torch.hypot(s1, s2) / MAX_DOLP).clamp(max=1)
-
-
-def frame_offset(
-    predicted: Float[Tensor, "n 2 h w"], truth: Float[Tensor, "n 2 h w"], valid: Bool[Tensor, "n h w"] | None = None
-) -> Float[Tensor, "n 2"]:
-    """Median over a frame's valid pixels of what `predicted` lacks of the true atanh(s1) and atanh(s2)."""
-    lacking = truth - predicted
-    if valid is not None:
-        lacking = torch.where(valid[:, None], lacking, torch.nan)
-    return lacking.flatten(-2).nanmedian(dim=-1).values
 
 
 def offset_scores(
@@ -42,13 +32,17 @@ def offset_scores(
     aolp: Float[Tensor, "n h w"],
     valid: Bool[Tensor, "n h w"] | None = None,
 ) -> dict[str, Float[Tensor, " n"]]:
-    """`offset`, the mean square of a frame's two offsets, and `no_offset_mse`, the MSE of DoLP without them.
+    """`offset` and `no_offset_mse` of each frame; a method without AoLP has neither.
 
-    A method without AoLP has neither.
+    The offsets of a frame are the medians, over its valid pixels, of what the prediction lacks of the true atanh(s1)
+    and atanh(s2). `offset` is their mean square, `no_offset_mse` the MSE of DoLP once they are added.
     """
     if prediction.aolp is None:
         return {}
-    own, truth = (contrasts(*maps) for maps in ((prediction.dolp.clamp(0, 1), prediction.aolp), (dolp, aolp)))
-    offset = frame_offset(own, truth, valid)
+    own, truth = (atanh_stokes(*maps) for maps in ((prediction.dolp.clamp(0, 1), prediction.aolp), (dolp, aolp)))
+    lacking = truth - own
+    if valid is not None:
+        lacking = torch.where(valid[:, None], lacking, torch.nan)
+    offset = lacking.flatten(-2).nanmedian(dim=-1).values
     moved = dolp_of(own + offset[..., None, None])
     return {"offset": offset.square().mean(1), "no_offset_mse": mse(moved, dolp, valid)}

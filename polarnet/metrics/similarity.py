@@ -191,6 +191,8 @@ def frame_scores(
 ) -> Mapping[str, Float[Tensor, " n"]]:
     """Scores of each frame as in the benchmark: mse, psnr, ssim, corr and, if an angle is predicted, aolp_deg.
 
+    `oracle_mse` is no score, but the MSE of the true frame's own mean (`spread_mse`).
+
     >>> import torch
     >>> from polarnet.metrics import frame_scores
     >>> from polarnet.stokes import Prediction
@@ -206,7 +208,7 @@ def frame_scores(
     }
     if prediction.aolp is not None:
         scores["aolp_deg"] = aolp_error_deg(prediction.aolp, aolp, dolp, valid)
-    return scores
+    return {**scores, "oracle_mse": spread_mse(dolp, valid)}
 
 
 def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:

@@ -25,7 +25,7 @@ from polarnet.events.streaming import (
 from polarnet.methods import METHODS
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.methods.overlap import advance, begin, equal_parts, warm_up
-from polarnet.metrics.similarity import frame_scores, spread_mse
+from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Piece
 from polarnet.recovery.ahead import Ahead
@@ -292,10 +292,7 @@ class TruthScores:
                 aolp = frame.prediction.aolp
                 batch = Prediction(frame.prediction.dolp[None], None if aolp is None else aolp[None])
                 valid = None if true.valid is None else true.valid[None]
-                scores = {
-                    **frame_scores(batch, true.dolp[None], true.aolp[None], valid),
-                    "oracle_mse": spread_mse(true.dolp[None], valid),
-                }
+                scores = frame_scores(batch, true.dolp[None], true.aolp[None], valid)
                 self._scores.append({name: float(values) for name, values in scores.items()})
             else:
                 self._unmatched += 1

@@ -14,7 +14,7 @@ from polarnet.benchmark.score import (
     summary,
 )
 from polarnet.metrics.lpips import Lpips
-from polarnet.metrics.offset import contrasts, dolp_of
+from polarnet.metrics.offset import atanh_stokes, dolp_of
 from polarnet.stokes import Prediction
 
 CPU = torch.device("cpu")
@@ -49,7 +49,7 @@ def test_a_constant_offset_scores_its_square_as_level_in_windows_after_the_warm_
 
 def test_an_offset_of_s1_and_s2_is_scored_apart_from_the_rest(sequence):
     truth = dataclasses.replace(sequence, dolp=0.5 * sequence.dolp)
-    moved = contrasts(truth.dolp, truth.aolp) + torch.tensor([0.3, -0.1])[:, None, None]
+    moved = atanh_stokes(truth.dolp, truth.aolp) + torch.tensor([0.3, -0.1])[:, None, None]
     s1, s2 = torch.tanh(moved).unbind(1)
     prediction = Prediction(dolp_of(moved), torch.atan2(s2, s1) / 2)
     valid = torch.rand(truth.dolp.shape, generator=torch.Generator().manual_seed(0)) < 0.8
