@@ -2,29 +2,35 @@
 
 import functools
 from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 from polarnet.events.stream import Events
 from polarnet.simulation.camera import Camera, grid, pixel_analyzers
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization, stretched
+from polarnet.stokes import NUM_CHANNELS
 from polarnet.storage.events import EventStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.terminal.progress import steps
 
-Mapper = Callable[..., Iterable[Any]]
-Emulated = tuple[list[Events], int, dict[str, Any], Tensor | None]
-"""Channels of a sequence, its duration in microseconds, the camera's drawn values and the analyzers of its pixels."""
-
 
 def emulate_scenes(
-    scenes: str | Path, events: str | Path, camera: Camera, seed: int, mapper: Mapper, threads: int
+    scenes: str | Path,
+    events: str | Path,
+    camera: Camera,
+    seed: int,
+    mapper: Callable[..., Iterable[Any]],
+    threads: int,
+    rotating: RotatingConfig | None = None,
 ) -> int:
     """Emulate all sequences of a scene store into an event store, and return their number; both may be at a URL.
+
+    With `rotating`, only the test sequences are emulated, behind the rotating polarizer alone: events are in the
+    store's first channel, the other three are empty.
 
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each of its tasks
     emulates one part on `threads` threads. The event store has the parts of the scene store. After an interruption, a
@@ -33,35 +39,39 @@ def emulate_scenes(
     """
     source = SceneStore.open(scenes)
     height, width, _ = grid(camera.polarizers.layout, source.sensor_height, source.sensor_width)
-    store = EventStore.create(
-        events, source.sequences, height, width, origin_of(source, camera, seed), source.sequences_per_part
-    )
-    return fill_store(store, functools.partial(_emulated, source, camera, seed, threads), mapper)
-
-
-def fill_store(store: EventStore, emulated: Callable[[str], Emulated], mapper: Mapper) -> int:
-    """Write each sequence that is missing in a store; returns the number of sequences."""
-    for _ in mapper(functools.partial(_fill_part, store, emulated), store.missing_parts()):
+    # all settings and data that determine the events; the checksum stands for the pixels of the scenes
+    inputs = {"seed": seed, "scenes": source.attributes, "scenes_sha256": source.header["checksum"]}
+    origin = {**camera.sections, **inputs, **({"rotating": asdict(rotating)} if rotating else {})}
+    sequences = source.of_split("test") if rotating else source.sequences
+    store = EventStore.create(events, sequences, height, width, origin, source.sequences_per_part)
+    emulate_part = functools.partial(_emulate_part, source, store, camera, seed, threads, rotating)
+    for _ in mapper(emulate_part, store.missing_parts()):
         pass
     store.finish()
-    return len(store.sequences)
+    return len(sequences)
 
 
-def _fill_part(store: EventStore, emulated: Callable[[str], Emulated], part: str) -> None:
+def _emulate_part(
+    scenes: SceneStore,
+    store: EventStore,
+    camera: Camera,
+    seed: int,
+    threads: int,
+    rotating: RotatingConfig | None,
+    part: str,
+) -> None:
+    size = scenes.sensor_height, scenes.sensor_width
     for sequence in steps(store.parts[part]):
-        store.write(sequence, *emulated(sequence))
-
-
-def origin_of(scenes: SceneStore, camera: Camera, seed: int) -> dict[str, Any]:
-    """All settings and data that determine the events of a scene store; its checksum stands for its pixels."""
-    return {**camera.sections, "seed": seed, "scenes": scenes.attributes, "scenes_sha256": scenes.header["checksum"]}
-
-
-def _emulated(scenes: SceneStore, camera: Camera, seed: int, threads: int, sequence: str) -> Emulated:
-    drawn, size = camera.drawn(seed, sequence), (scenes.sensor_height, scenes.sensor_width)
-    scene, trajectory, duration_us = motion_over(scenes, sequence)
-    channels = emulate_motion(drawn, scene, trajectory, duration_us, size, threads)
-    return channels, duration_us, camera.draws(seed, sequence), pixel_analyzers(drawn, *size)
+        drawn, analyzer = camera.drawn(seed, sequence, "rotating" if rotating else "emulate"), None
+        scene, trajectory, duration_us = motion_over(scenes, sequence)
+        if rotating:
+            pixels = grid(camera.polarizers.layout, *size)
+            first = emulate_rotating(rotating, drawn, scene, trajectory, duration_us, pixels)
+            channels = [first, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)]
+        else:
+            channels = emulate_motion(drawn, scene, trajectory, duration_us, size, threads)
+            analyzer = pixel_analyzers(drawn, *size)
+        store.write(sequence, channels, duration_us, camera.draws(seed, sequence), analyzer)
 
 
 def motion_over(scenes: SceneStore, sequence: str) -> tuple[PolarizationScene, Trajectory, int]:

@@ -9,9 +9,10 @@ from simulation_fixtures import QUIET, REST, STILL
 from polarnet.config.tree import load
 from polarnet.simulation import SENSORS, emulate, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
+from polarnet.simulation.event_sets import emulate_scenes
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
-from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.storage import EventStore, SceneStore
 from polarnet.storage.frames import Contents, Polarization
 
@@ -77,8 +78,8 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     for name in names:
         store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), asdict(trajectory), 100_000)
     store.finish()
-    arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.rotating, config.camera, config.seed, map
-    assert emulate_rotating_scenes(*arguments) == 1
+    arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.camera, config.seed, map, 1
+    assert emulate_scenes(*arguments, config.rotating) == 1
     events = EventStore.open(tmp_path / "events.zarr")
     assert events.sequences == ["wood-00"]
     first, *others = events.read("wood-00")
@@ -86,8 +87,7 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     assert len(first) > 0
     assert [len(channel) for channel in others] == [0, 0, 0]
     written = (tmp_path / "events.zarr" / "zarr.json").read_bytes()
-    assert emulate_rotating_scenes(*arguments) == 1
+    assert emulate_scenes(*arguments, config.rotating) == 1
     assert (tmp_path / "events.zarr" / "zarr.json").read_bytes() == written
-    faster = replace(config.rotating, rate_hz=30.0)
-    emulate_rotating_scenes(*arguments[:2], faster, *arguments[3:])
+    emulate_scenes(*arguments, replace(config.rotating, rate_hz=30.0))
     assert len(EventStore.open(tmp_path / "events.zarr").read("wood-00")[0]) > len(first)
