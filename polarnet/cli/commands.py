@@ -296,7 +296,7 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
 def _recover_rotating(command: AddCommand) -> None:
     rotating = command(
         "recover-rotating",
-        "recover_rotating.run",
+        "recover.rotating",
         "recover DoLP and AoLP from one camera behind a rotating polarizer",
         "recover-rotating camera.raw --rate 15 --start-angle 30",
         "recover-rotating camera.raw --triggers turns.txt",
