@@ -20,7 +20,7 @@ from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
 from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
 from polarnet.simulation.pixels.defects import Defects, defects_of
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.pixels.physics import MAX_RATE_HZ
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ, PixelConfig
 from polarnet.simulation.ranges import check_ranges
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
@@ -66,7 +66,7 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 
 
 @section
-class EmulatorConfig(esim.EsimConfig):
+class EmulatorConfig(PixelConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
