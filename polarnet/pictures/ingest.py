@@ -198,9 +198,10 @@ def _convert(item: tuple[int, Source], config: IngestConfig, seed: int, folder: 
         return Skipped(source.files[0].name if source.kind == "photograph" else source.origin, str(error))
     file = f"source-{number:08d}{suffix}"
     write(folder / file)
-    about = {"licence": source.licence, "author": source.author, "height": config.height, "width": config.width} | about
+    given: dict[str, Any] = {"licence": source.licence, "author": source.author}
+    size: dict[str, Any] = {"height": config.height, "width": config.width}
     name = f"{_slug(source.stem)}-{about['sha256'][:8]}"
-    return ManifestEntry(name=name, file=file, source=source.kind, origin=source.origin, **about)
+    return ManifestEntry(name=name, file=file, source=source.kind, origin=source.origin, **(given | size | about))
 
 
 def _read_photograph(source: Source, config: IngestConfig, _seed: int) -> Read:

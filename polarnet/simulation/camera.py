@@ -21,9 +21,8 @@ from polarnet.events.stream import Events, select
 from polarnet.runtime.compilation import compiled, forget_stale_code
 from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.emulator import EmulatorConfig, draws
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.ranges import draws
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 Value = TypeVar("Value")
