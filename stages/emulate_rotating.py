@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.simulation.event_sets import emulate_scenes
+from polarnet.simulation.sets import emulate_scenes
 
 ROTATING = "data/rotating"  # `needs` of a row that sees these events
 

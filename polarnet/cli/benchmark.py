@@ -30,8 +30,7 @@ from polarnet.reports.artefacts import read_results, results_table
 from polarnet.reports.page import write_set_page
 from polarnet.reports.tables import as_plain
 from polarnet.runtime.machine import configure, on_one_thread, usable_cores
-from polarnet.simulation.event_sets import emulate_scenes
-from polarnet.simulation.sets import make_folder_set
+from polarnet.simulation.sets import emulate_scenes, make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.frames import FrameStore

@@ -111,11 +111,6 @@ class Camera:
             "readout": asdict(self.readout),
         }
 
-    def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
-        """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
-        drawn = draws(self.sensor, seed, sequence)
-        return {"emulate": drawn} if drawn else {}
-
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""
         sensor = replace(self.sensor, **draws(self.sensor, seed, sequence), randomise=None)

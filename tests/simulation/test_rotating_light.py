@@ -9,10 +9,10 @@ from simulation_fixtures import QUIET, REST, STILL
 from polarnet.config.tree import load
 from polarnet.simulation import SENSORS, emulate, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
-from polarnet.simulation.event_sets import emulate_scenes
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
+from polarnet.simulation.sets import emulate_scenes
 from polarnet.storage import EventStore, SceneStore
 from polarnet.storage.frames import Contents, Polarization
 
