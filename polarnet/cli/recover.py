@@ -1,4 +1,4 @@
-"""`polarnet recover`: DoLP and AoLP of recordings or of a running camera."""
+"""`polarnet recover` and `recover-rotating`: DoLP and AoLP of recordings or of a running camera."""
 
 import argparse
 import functools
@@ -23,9 +23,9 @@ from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
-from polarnet.recovery.inputs import input_of, open_channels, open_frames, open_live
+from polarnet.recovery.inputs import input_of, open_channels, open_frames, open_live, open_rotating, rotation_of
 from polarnet.recovery.stream import Input, TruthScores, frames_of, open_method, recover
-from polarnet.recovery.writer import RecoveryWriter
+from polarnet.recovery.writer import OUTPUTS, RecoveryWriter
 from polarnet.runtime.machine import precision_on
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
 from polarnet.storage.events import EventStore
@@ -34,6 +34,7 @@ from polarnet.terminal.suggestions import did_you_mean
 
 WHOLE_METHOD, PAST_METHOD = "registered", "ours"
 """Methods unless --method names one: over a whole recording, and from window to window."""
+ROTATING_METHOD = "rotating_polarizer"
 RECONSTRUCT = "highpass"
 """Method whose intensities are the S0 of the video."""
 ARRANGEMENTS = ("angles", "mosaic", "sequence")
@@ -85,6 +86,24 @@ def run(options: argparse.Namespace) -> None:
         if frames is not None and not len(frames.between(0, writer.stop_us).t_us):
             notes.append(f"none of its {len(frames.t_us)} frames lies within the events: are they on one clock?")
         notes += damage(source)
+        page = writer.write_page(source.name, {"command": options.command_line, **facts}, notes)
+    print_results(facts, notes, out / page.name)
+
+
+def rotating(options: argparse.Namespace) -> None:
+    """Fit every half turn of a rotating polarizer, write the files and print facts about the input and the result."""
+    rotation = rotation_of(options.rate, options.triggers, options.start_angle)
+    step_us = duration_us(options, "step", "10ms")
+    source, rotation = open_rotating(options.input, rotation, functools.partial(open_recording, **reading_of(options)))
+    rule = WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
+    method = METHODS[ROTATING_METHOD]
+    recoverer = method.open(replace(setup_of(load(settings_root()), method), rotation=rotation))
+    out = options.out or Path("outputs") / "recover" / options.input.name
+    with run_folder(out, "recover-rotating") as folder:
+        writer = RecoveryWriter(folder, OUTPUTS)
+        words = f"{method.name}, {rotation.rate_hz:g} turns/s"
+        facts = recover(source, rule, words, writer, frames_of(source, rule, recoverer))
+        notes = damage(source)
         page = writer.write_page(source.name, {"command": options.command_line, **facts}, notes)
     print_results(facts, notes, out / page.name)
 
