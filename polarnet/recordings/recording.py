@@ -175,7 +175,7 @@ def read_recording(
     """
     reader = open_recording(path, format, height=height, width=width, part=part)
     (events,) = whole(([chunk] for chunk in reader), reader.height, reader.width, 1)
-    log_repairs(reader)
+    log_repairs(reader.path.name, reader.repairs)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 
 
@@ -191,11 +191,18 @@ def whole(blocks: Iterable[Sequence[Events]], height: int, width: int, number: i
     return [Events(t, x, y, p, height, width) for t, x, y, p in (map(torch.from_numpy, columns) for columns in tables)]
 
 
-def log_repairs(reader: RecordingReader) -> None:
-    """Log a warning for each kind of damage that the latest iteration of a reader repaired."""
-    for kind, count in reader.repairs.items():
+def log_repairs(name: str, counts: Counts) -> None:
+    """Log a warning for each kind of damage of a file."""
+    for kind, count in counts.items():
         if count and kind not in HARMLESS:
-            logger.warning("%s: %d %s", reader.path.name, count, REPAIRS[kind])
+            logger.warning("%s: %d %s", name, count, REPAIRS[kind])
+
+
+def first_time_us(reader: RecordingReader) -> int:
+    """Time of the first event; RecordingError for a file without events."""
+    for events in reader:
+        return int(events.t[0])
+    raise RecordingError(f"{reader.path.name}: expected events, the file has none")
 
 
 def is_recording(path: Path) -> bool:
