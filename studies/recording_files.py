@@ -11,7 +11,7 @@ from jaxtyping import Float, Int64, UInt8
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, slice_count
 from polarnet.networks.e2p.network import MOSAIC
-from polarnet.recordings.formats.aedat3 import PACKET
+from polarnet.recordings.formats.aedat import PACKET
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text

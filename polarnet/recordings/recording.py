@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag
+from polarnet.recordings.formats import aedat, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import (
     GZIP,
@@ -72,8 +72,8 @@ FORMATS = {
         faery.aedat4_frames,
         parts=True,
     ),
-    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, parts=True),
-    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
+    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat.MAGIC_3), aedat.open_aedat3, parts=True),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat.MAGIC_2), aedat.open_aedat2, aedat.aedat2_frames),
     "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), partial(faery.open_faery, aedat4=False)),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
