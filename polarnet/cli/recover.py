@@ -117,11 +117,12 @@ def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Se
 def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner) -> Input:
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
-        return open_live(options.input[0], mosaic, options.idle, cleaner)
-    open_file = functools.partial(open_recording, **reading_of(options))
-    paths = [Path(path) for path in options.input]
-    source = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
-    return source._replace(pieces=cleaner.clean(source.pieces))
+        source = open_live(options.input[0], mosaic, options.idle)
+    else:
+        open_file = functools.partial(open_recording, **reading_of(options))
+        paths = [Path(path) for path in options.input]
+        source = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
+    return source._replace(pieces=cleaner.clean(source.pieces, live=source.live))
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:

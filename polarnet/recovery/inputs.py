@@ -14,7 +14,6 @@ from polarnet.events.stream import Events
 from polarnet.recordings.arrangements import FilePieces, Input, Open, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
 from polarnet.recordings.live import SCHEME, read_camera, read_lines
-from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.recording import first_time_us, open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import check_size, read_truth
@@ -90,7 +89,7 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
     return StokesFrames(truth.t_us, stokes, truth.valid).since(first_time_us(reader))
 
 
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> Input:
     """Read live from standard input (-), a file, or a camera (dv://...), which ends after `idle_s` without an event.
 
     ValueError for a camera without a mosaic.
@@ -98,14 +97,12 @@ def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -
     if path.startswith(SCHEME):
         if mosaic is None:
             raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
-        source = read_camera(path, mosaic, idle_s)
-    elif path == STANDARD_INPUT:
-        source = read_lines(sys.stdin.buffer, "standard input", mosaic)
-    elif Path(path).is_file():
-        source = read_lines(open(path, "rb"), Path(path).name, mosaic)  # noqa: SIM115 - read until the end
-    else:
+        return read_camera(path, mosaic, idle_s)
+    if path == STANDARD_INPUT:
+        return read_lines(sys.stdin.buffer, "standard input", mosaic)
+    if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
-    return source._replace(pieces=clean.clean(source.pieces, live=True))
+    return read_lines(open(path, "rb"), Path(path).name, mosaic)
 
 
 def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: float) -> Rotation:

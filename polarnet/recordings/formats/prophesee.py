@@ -185,7 +185,7 @@ def _decode_vectors(kinds, words, state, t, x, y, p):
     n, orphans = 0, 0
     for i in range(len(words)):
         word = np.int64(words[i])
-        kind, value = kinds[word >> 12], word & 0xFFF
+        kind, value = kinds[np.uint64(word >> 12)], word & 0xFFF  # unsigned: no check for a place from the end
         if kind == LOW:
             low = value
         elif kind in (HIGH, HIGH_AND_LOW):
