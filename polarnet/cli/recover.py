@@ -18,13 +18,14 @@ from polarnet.events.streaming import TRAINED_WINDOW_US, WindowRule
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup, why_absent
 from polarnet.pictures.images import extension, picture_extensions
+from polarnet.recordings.arrangements import Input
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
-from polarnet.recovery.inputs import input_of, open_channels, open_frames, open_live, open_rotating, rotation_of
-from polarnet.recovery.stream import Input, TruthScores, frames_of, open_method, recover
+from polarnet.recovery.inputs import open_channels, open_frames, open_live, open_rotating, rotation_of
+from polarnet.recovery.stream import TruthScores, frames_of, open_method, recover
 from polarnet.recovery.writer import OUTPUTS, RecoveryWriter
 from polarnet.runtime.machine import precision_on
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
@@ -110,7 +111,7 @@ def rotating(options: argparse.Namespace) -> None:
 
 def damage(source: Input) -> list[str]:
     """A sentence for each kind of unusable events in each file that was read."""
-    kinds = [(name, kind, count) for name, repairs in source.repairs.items() for kind, count in repairs.items()]
+    kinds = [(name, kind, count) for name, repairs in source.repairs for kind, count in repairs.items()]
     return [f"{name}: {count:,} {REPAIRS[kind]}." for name, kind, count in kinds if count and kind not in HARMLESS]
 
 
@@ -135,11 +136,12 @@ def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Se
 def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner) -> Input:
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
-        return open_live(options.input[0], mosaic, options.idle, cleaner)
-    open_file = functools.partial(open_recording, **reading_of(options))
-    paths = [Path(path) for path in options.input]
-    channels = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
-    return input_of(", ".join(path.name for path in paths), channels, cleaner)
+        source = open_live(options.input[0], mosaic, options.idle)
+    else:
+        open_file = functools.partial(open_recording, **reading_of(options))
+        paths = [Path(path) for path in options.input]
+        source = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
+    return source._replace(pieces=cleaner.clean(source.pieces, live=source.live))
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:
