@@ -2,7 +2,7 @@
 
 from polarnet.config.tree import Config, hydra_stage
 from polarnet.runtime.machine import threads_of
-from polarnet.simulation.event_sets import emulate_scenes
+from polarnet.simulation.sets import emulate_scenes
 
 
 @hydra_stage

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.simulation.rotating import emulate_rotating_scenes
+from polarnet.simulation.sets import emulate_scenes
 
 ROTATING = "data/rotating"  # `needs` of a row that sees these events
 
@@ -19,7 +19,7 @@ def main(config: Config) -> None:
     sources["simulated"] = Path(config.paths.scenes)
     for name, scenes in sources.items():
         events, mapper = Path(config.paths.rotating) / f"{name}.zarr", config.mapper("emulate_rotating")
-        count = emulate_rotating_scenes(scenes, events, config.rotating, config.camera, config.seed, mapper)
+        count = emulate_scenes(scenes, events, config.camera, config.seed, mapper, 1, config.rotating)
         print(f"{name}: {count} sequences")
 
 

@@ -13,10 +13,10 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.tree import Config
 from polarnet.events.stream import concatenate
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.event_sets import motion_over
 from polarnet.simulation.motion import Sine, Trajectory, frame_times_us
 from polarnet.simulation.pixels.light import FULL_SCALE
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
+from polarnet.simulation.sets import motion_over
 from polarnet.simulation.truth import frames_of
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int64, UInt8
 from polarnet.events.mosaic import places_of
 from polarnet.events.stream import Events, slice_count
 from polarnet.networks.e2p.network import MOSAIC
-from polarnet.recordings.formats import aedat3, celex5
+from polarnet.recordings.formats import aedat, celex5
 from polarnet.recordings.formats.hdf5 import LAYOUTS
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.writers import h5py_module, write_hdf5, write_text
@@ -75,7 +75,7 @@ def evt3(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
 def aedat3_packet(t: np.ndarray, x: np.ndarray, y: np.ndarray, p: np.ndarray) -> bytes:
     """A packet of AEDAT 3.1."""
     entries = np.stack([x << 17 | y << 2 | p << 1 | 1, t], axis=1).astype("<u4")
-    return aedat3.PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
+    return aedat.PACKET.pack(1, 1, 8, 4, 0, *[len(t)] * 3) + entries.tobytes()
 
 
 def write_aedat2(path: Path, events: Events, t_us: Int64[np.ndarray, " n"], frames: UInt8[np.ndarray, "n h w"]) -> None:

@@ -51,9 +51,9 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import configure, generator_for
 from polarnet.simulation.camera import grid
-from polarnet.simulation.event_sets import motion_over
 from polarnet.simulation.motion import frame_times_us
 from polarnet.simulation.moving_sensor import emulate_motion
+from polarnet.simulation.sets import motion_over
 from polarnet.simulation.truth import frames_of, valid_frames
 from polarnet.stokes import Prediction, StokesFrames, intensities_from_stokes, stokes_from_intensities
 from polarnet.storage.scenes import SceneStore

@@ -179,9 +179,9 @@ def simulated(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> S
 
     from polarnet.config.tree import load
     from polarnet.simulation.camera import Camera
-    from polarnet.simulation.event_sets import emulate_scenes
     from polarnet.simulation.motion import frame_times_us, random_trajectory
     from polarnet.simulation.scene import scene_from_polarization
+    from polarnet.simulation.sets import emulate_scenes
     from polarnet.simulation.truth import frames_of
     from polarnet.storage.frames import Contents, FrameStore, Polarization
     from polarnet.storage.scenes import SceneStore, as_stored

@@ -44,7 +44,8 @@ def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate |
     if len(durations) <= supported:
         return None
     shortest = durations[supported]
-    if shortest < MIN_TICKS * _tick_us(durations):
+    tick_us = float(np.gcd.reduce(np.rint(durations).astype(np.int64)))  # step of the recording's clock
+    if shortest < MIN_TICKS * tick_us:
         return None  # a coarse clock piles intervals up as well
     edges = np.searchsorted(durations, shortest * np.array([0.9, 1.1, 1.3]))
     piled, next_to = np.diff(edges)
@@ -52,8 +53,3 @@ def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate |
         return None
     near = durations[edges[0] : edges[1]]
     return Estimate(float(np.median(near)), float(near.std()) / math.sqrt(len(near)), "shortest intervals of a pixel")
-
-
-def _tick_us(durations: Float64[np.ndarray, " _"]) -> float:
-    """Step of the recording's clock."""
-    return float(np.gcd.reduce(np.rint(durations).astype(np.int64)))

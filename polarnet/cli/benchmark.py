@@ -30,8 +30,7 @@ from polarnet.reports.artefacts import read_results, results_table
 from polarnet.reports.page import write_set_page
 from polarnet.reports.tables import as_plain
 from polarnet.runtime.machine import configure, on_one_thread, usable_cores
-from polarnet.simulation.rotating import emulate_rotating_scenes
-from polarnet.simulation.sets import make_folder_set
+from polarnet.simulation.sets import emulate_scenes, make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.frames import FrameStore
@@ -94,7 +93,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         rotating = None
         if any(map(is_rotating, methods)):
             rotating, mapper = work.with_name("rotating.zarr"), config.mapper("emulate_rotating")
-            emulate_rotating_scenes(work / "scenes.zarr", rotating, config.rotating, config.camera, config.seed, mapper)
+            emulate_scenes(work / "scenes.zarr", rotating, config.camera, config.seed, mapper, 1, config.rotating)
         test_set = made_set(root.name, work, rotating)
         mapper = config.mapper("benchmark")
 

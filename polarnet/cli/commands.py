@@ -41,6 +41,8 @@ class Command(argparse.ArgumentParser):
 
 AddCommand: TypeAlias = Callable[..., Command]
 """`_command` without its first argument."""
+AddArgument: TypeAlias = Callable[..., object]
+"""`add_argument` of a command."""
 
 BESIDE = ""
 """Value of --truth without a path."""
@@ -103,7 +105,7 @@ def _command(
 
 
 def _project(command: AddCommand) -> None:
-    demo = command(
+    add = command(
         "demo",
         "simulate.demo",
         "a first result in a few minutes: simulate a built-in photograph, recover its DoLP and score it",
@@ -111,52 +113,50 @@ def _project(command: AddCommand) -> None:
         description="Simulates a camera with four polarizers that moves over a photograph, recovers DoLP and AoLP from "
         "its events with the shipped weights, and scores them against the truth. `polarnet simulate` and `polarnet "
         "recover --truth` do the halves, on your own files.",
-    )
-    demo.add_argument("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")
-    _overrides(demo)
+    ).add_argument
+    add("--out", type=Path, metavar="FOLDER", default=Path("outputs/demo"), help="default: outputs/demo")
+    _overrides(add)
     command("doctor", "doctor.doctor", "report versions, device, weights, extras, memory and disk", "doctor")
-    preset = command(
+    add = command(
         "preset",
         "project.preset",
         "write a named experiment or sensor into params.yaml",
         "preset smoke",
-    )
-    preset.add_argument("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
-    new = command(
+    ).add_argument
+    add("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
+    add = command(
         "new",
         "project.new",
         "write a project with the pipeline: dvc.yaml, params.yaml, conf, stages",
         "new lake && cd lake && polarnet preset smoke && dvc repro",
         description="Writes a folder in which `dvc repro` runs the pipeline with the installed polarnet. The stages "
         "run again after a change of version.txt, which names polarnet's version.",
-    )
-    new.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
+    ).add_argument
+    add("folder", type=Path, metavar="FOLDER", help="folder to write; it must be new or empty")
 
 
 def _stores(command: AddCommand) -> None:
-    view = command(
+    add = command(
         "view",
         "stores.view",
         "look at a store, a recording or a recovery in a page that plays it",
         "view data/frames.zarr --sequence lake-00",
         description="Writes a page that plays events, S0, DoLP and AoLP, and opens it in the browser. If the folder "
         "has a page, as that of a recovery does, it opens that page.",
-    )
-    view.add_argument("path", type=input_path, help="store, folder with stores, recovery, or a camera's file")
-    view.add_argument("--sequence", nargs="+", metavar="NAME", help="sequences (default: the first twelve)")
-    view.add_argument("--out", type=Path, help="page (default: outputs/view/NAME.html)")
-    view.add_argument("--no-browser", action="store_true", help="write the page without opening it")
-    _reading(view)
-    verify = command(
+    ).add_argument
+    add("path", type=input_path, help="store, folder with stores, recovery, or a camera's file")
+    add("--sequence", nargs="+", metavar="NAME", help="sequences (default: the first twelve)")
+    add("--out", type=Path, help="page (default: outputs/view/NAME.html)")
+    add("--no-browser", action="store_true", help="write the page without opening it")
+    _reading(add)
+    add = command(
         "verify",
         "stores.verify",
         "check every byte of a store, a checkpoint or a data folder",
         "verify data/events.zarr",
-    )
-    verify.add_argument(
-        "store", type=input_name, help="store or its URL, checkpoint (.safetensors), running.pt, folder"
-    )
-    video = command(
+    ).add_argument
+    add("store", type=input_name, help="store or its URL, checkpoint (.safetensors), running.pt, folder")
+    add = command(
         "video",
         "stores.video",
         "draw a stored sequence and its truth as a video that browsers play",
@@ -165,24 +165,22 @@ def _stores(command: AddCommand) -> None:
         description="Draws the events behind each polarizer, red and blue, beside the true S0, DoLP, AoLP and "
         "polarization (hue, saturation and value), one picture a true frame, as H.264 in MP4. `polarnet recover` draws "
         "predictions.",
-    )
-    video.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
-    video.add_argument("sequence", nargs="?", help="name of the sequence (default: the only one)")
-    video.add_argument(
-        "--truth", type=input_name, metavar="FRAMES", help="true frames (default: those beside the store)"
-    )
-    video.add_argument("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
-    replay = command(
+    ).add_argument
+    add("store", type=input_name, help="event store: folder or fsspec URL")
+    add("sequence", nargs="?", help="name of the sequence (default: the only one)")
+    add("--truth", type=input_name, metavar="FRAMES", help="true frames (default: those beside the store)")
+    add("--out", type=Path, metavar="FILE", help="MP4 to write (default: outputs/video/SEQUENCE.mp4)")
+    add = command(
         "replay",
         "stores.replay",
         "print a stored sequence as lines `t x y p angle`, at its own pace",
         "replay data/events.zarr lake-0 --speed 0.5",
         description="Prints the events of a stored sequence at the pace of the recording. Pipe them into `polarnet "
         "recover - --live` to try live recovery without a camera.",
-    )
-    replay.add_argument("store", type=input_name, help="event store: folder or fsspec URL")
-    replay.add_argument("sequence", help="name of the sequence")
-    replay.add_argument("--speed", type=positive, default=1.0, help="speed relative to the recording (default: 1)")
+    ).add_argument
+    add("store", type=input_name, help="event store: folder or fsspec URL")
+    add("sequence", help="name of the sequence")
+    add("--speed", type=positive, default=1.0, help="speed relative to the recording (default: 1)")
 
 
 def _simulate(command: AddCommand) -> None:
@@ -226,7 +224,7 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
 
 
 def _inspect(command: AddCommand) -> None:
-    inspect = command(
+    add = command(
         "inspect",
         "stores.inspect",
         "summarise a camera's file and draw its busiest moment, or list the sequences of a store",
@@ -234,14 +232,14 @@ def _inspect(command: AddCommand) -> None:
         description="Prints format, sensor size (height x width), duration, event counts, rates and hot pixels of a "
         "camera's file, with its longest gap and empty rows. Draws its busiest moment as a PNG, and "
         "lists the hot pixels for `polarnet recover --hot-pixels FILE`. Of a store it names the sequences.",
-    )
-    inspect.add_argument("file", type=input_name, help="file of a camera, or a store to list")
-    _reading(inspect)
-    inspect.add_argument("--out", type=Path, metavar="FOLDER", help="folder of these files (default: outputs/inspect)")
+    ).add_argument
+    add("file", type=input_name, help="file of a camera, or a store to list")
+    _reading(add)
+    add("--out", type=Path, metavar="FOLDER", help="folder of these files (default: outputs/inspect)")
 
 
 def _recover(command: AddCommand) -> None:
-    recover = command(
+    add = command(
         "recover",
         "recover.run",
         "recover DoLP and AoLP from recordings or from a running camera",
@@ -258,8 +256,7 @@ Writes the frames as numbers, a video and a page. INPUT is one of:
 - an event store
 - with --live, standard input (-) or a file with lines `t x y p angle`, or a camera with --mosaic: \
 dv://HOST:PORT of a program that streams its events, or dv://camera""",
-    )
-    add = recover.add_argument
+    ).add_argument
     add("input", nargs="+", type=input_name, metavar="INPUT", help="recordings, an event store, or -")
     add("--angles", nargs=4, type=int, metavar="DEG", help="polarizer angles of the four files, in order")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
@@ -271,7 +268,7 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")
     add("--live", action="store_true", help="recover while events arrive, and print the latency")
     add("--idle", type=float, default=5.0, metavar="S", help="seconds until a silent camera has ended (default: 5)")
-    _cleaning(recover)
+    _cleaning(add)
     add("--window", help="length in time (default: 33.333ms, as in training)")
     add("--step", help="time between frames (default: a window)")
     add(
@@ -290,30 +287,29 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
     formats = ("zarr", "mp4")
     add("--write", nargs="+", choices=formats, default=formats, help="files (default: zarr mp4)")
-    _reading(recover)
+    _reading(add)
 
 
 def _recover_rotating(command: AddCommand) -> None:
-    rotating = command(
+    add = command(
         "recover-rotating",
-        "recover_rotating.run",
+        "recover.rotating",
         "recover DoLP and AoLP from one camera behind a rotating polarizer",
         "recover-rotating camera.raw --rate 15 --start-angle 30",
         "recover-rotating camera.raw --triggers turns.txt",
         description="Fits every half turn of the polarizer, pixel by pixel. Writes the files of `polarnet recover`.",
-    )
-    add = rotating.add_argument
+    ).add_argument
     add("input", type=input_path, metavar="INPUT", help="recording of the camera")
     add("--rate", type=float, metavar="HZ", help="turns a second of the polarizer; negative: the other way")
     add("--triggers", type=input_path, metavar="FILE", help="times of its triggers in us, one a turn: text or HDF5")
     add("--start-angle", type=float, default=0.0, metavar="DEG", help="at time 0 or the first trigger (default: 0)")
     add("--step", help="time between frames: 10ms (default: half a turn)")
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/recover/NAME)")
-    _reading(rotating)
+    _reading(add)
 
 
 def _convert(command: AddCommand) -> None:
-    convert = command(
+    add = command(
         "convert",
         "convert.convert",
         "convert a recording or an event store to HDF5 (DSEC's layout), text or EVT3",
@@ -322,19 +318,18 @@ def _convert(command: AddCommand) -> None:
         description="Reads any recording that `polarnet inspect` reads, repairs it as reading does, and writes its "
         "events, or those of a time span. Times in OUT count from the start of the span. Of an event store, "
         "writes a folder with one file for each sequence and channel.",
-    )
-    add = convert.add_argument
+    ).add_argument
     add("file", type=input_name, metavar="IN", help="file of a camera, a bag, or an event store (folder or fsspec URL)")
     add("out", type=Path, metavar="OUT", help="file to write; of an event store, the folder")
     add("--to", choices=("evt3", "hdf5", "text"), help="format (default: by the suffix of OUT; of a store: hdf5)")
     add("--start", metavar="TIME", help="start of the span after the first event: 500ms (default: 0s)")
     add("--stop", metavar="TIME", help="end of the span after the first event, exclusive")
     add("--sequence", nargs="+", metavar="NAME", help="sequences of an event store (default: all)")
-    _reading(convert)
+    _reading(add)
 
 
 def _fit_sensor(command: AddCommand) -> None:
-    fit = command(
+    add = command(
         "fit-sensor",
         "fit_sensor.run",
         "fit the simulated sensor to a camera's recordings",
@@ -342,8 +337,7 @@ def _fit_sensor(command: AddCommand) -> None:
         description="Estimates thresholds, their deviations, bandwidth, refractory period, leak, shot noise and hot "
         "pixels of a camera from its recordings; prints a table and writes conf/sensor/NAME.yaml. docs/fit-sensor.md "
         "says what to record.",
-    )
-    add = fit.add_argument
+    ).add_argument
     add("--name", required=True, help="name of the sensor: sensor=NAME uses it")
     add("--static", type=input_path, metavar="FILE", help="recording under constant light")
     add("--static-light", type=float, metavar="DN", help="its brightness, 0 (covered lens) to 255 (default: 127.5)")
@@ -351,11 +345,11 @@ def _fit_sensor(command: AddCommand) -> None:
     add("--contrast", type=float, metavar="C", help="contrast of the flicker, (max - min) / (max + min)")
     add("--frequency", type=float, nargs="+", metavar="HZ", help="frequency of each flicker recording")
     add("--flicker-light", type=float, default=127.5, metavar="DN", help="mean of the flicker (default: 127.5)")
-    _reading(fit)
+    _reading(add)
 
 
 def _onnx(command: AddCommand) -> None:
-    onnx = command(
+    add = command(
         "onnx",
         "convert.onnx",
         "export a network as an ONNX file, checked with ONNX Runtime",
@@ -363,8 +357,7 @@ def _onnx(command: AddCommand) -> None:
         description="The exported network takes the events of one window and a state, and returns DoLP and the new "
         "state; the file's metadata describes all inputs and outputs. The file is renamed to OUT.onnx once ONNX "
         "Runtime reproduces torch's outputs.",
-    )
-    add = onnx.add_argument
+    ).add_argument
     add("file", type=Path, metavar="OUT.onnx", help="file to write")
     add("--weights", type=input_path, metavar="FILE", help="checkpoint of the network (default: the shipped one)")
     add("--height", type=int, default=120, help="sensor rows; the file works for this size only (default: 120)")
@@ -392,28 +385,26 @@ def _benchmark(command: AddCommand) -> None:
         help="of --scenes; auto recognises .npz and NAME_0, NAME_45, ... as measured polarization (default: auto)",
     )  # fmt: skip
     add("--mosaic", metavar="'A B / C D'", help="polarizers of 2x2 pixels of --recordings (default: 90 45 / 135 0)")
-    _cleaning(benchmark)
+    _cleaning(add)
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/benchmark/NAME)")
     add("--methods", help="separated by commas (default: benchmark.methods)")
     add("--limit", type=int, metavar="N", help="use only N pictures of --scenes")
-    _overrides(benchmark)
+    _overrides(add)
 
 
-def _overrides(command: Command) -> None:
-    command.add_argument("overrides", nargs="*", help="values that replace those of params.yaml: sensor=noisy seed=2")
+def _overrides(add: AddArgument) -> None:
+    add("overrides", nargs="*", help="values that replace those of params.yaml: sensor=noisy seed=2")
 
 
-def _cleaning(command: Command) -> None:
+def _cleaning(add: AddArgument) -> None:
     """Options that remove noise from events, which `polarnet.cli.options.cleaning_of` reads."""
-    command.add_argument("--hot-pixels", metavar="found|FILE", help="pixels to remove: those found, or lines `x y`")
-    command.add_argument("--background", metavar="TIME", help="remove events without a neighbour's in TIME: 10ms")
+    add("--hot-pixels", metavar="found|FILE", help="pixels to remove: those found, or lines `x y`")
+    add("--background", metavar="TIME", help="remove events without a neighbour's in TIME: 10ms")
 
 
-def _reading(command: Command) -> None:
+def _reading(add: AddArgument) -> None:
     """Options that describe a camera's file, which `polarnet.cli.options.reading_of` reads."""
-    command.add_argument("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
-    command.add_argument(
-        "--part", help="of a file with several: topic of a bag, stream of AEDAT, camera of M3ED or MVSEC"
-    )
-    command.add_argument("--height", type=int, help="rows of the sensor, if the file does not state them")
-    command.add_argument("--width", type=int, help="columns of the sensor, if the file does not state them")
+    add("--format", help="of the input, if it cannot be recognised: text, celex5_csv, celex5_bin, ...")
+    add("--part", help="of a file with several: topic of a bag, stream of AEDAT, camera of M3ED or MVSEC")
+    add("--height", type=int, help="rows of the sensor, if the file does not state them")
+    add("--width", type=int, help="columns of the sensor, if the file does not state them")

@@ -1,4 +1,4 @@
-"""`polarnet recover`: DoLP and AoLP of recordings or of a running camera."""
+"""`polarnet recover` and `recover-rotating`: DoLP and AoLP of recordings or of a running camera."""
 
 import argparse
 import functools
@@ -18,14 +18,15 @@ from polarnet.events.streaming import TRAINED_WINDOW_US, WindowRule
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup, why_absent
 from polarnet.pictures.images import extension, picture_extensions
+from polarnet.recordings.arrangements import Input
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.recordings.recording import is_recording, open_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
-from polarnet.recovery.inputs import input_of, open_channels, open_frames, open_live
-from polarnet.recovery.stream import Input, TruthScores, frames_of, open_method, recover
-from polarnet.recovery.writer import RecoveryWriter
+from polarnet.recovery.inputs import open_channels, open_frames, open_live, open_rotating, rotation_of
+from polarnet.recovery.stream import TruthScores, frames_of, open_method, recover
+from polarnet.recovery.writer import OUTPUTS, RecoveryWriter
 from polarnet.runtime.machine import precision_on
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
 from polarnet.storage.events import EventStore
@@ -34,6 +35,7 @@ from polarnet.terminal.suggestions import did_you_mean
 
 WHOLE_METHOD, PAST_METHOD = "registered", "ours"
 """Methods unless --method names one: over a whole recording, and from window to window."""
+ROTATING_METHOD = "rotating_polarizer"
 RECONSTRUCT = "highpass"
 """Method whose intensities are the S0 of the video."""
 ARRANGEMENTS = ("angles", "mosaic", "sequence")
@@ -89,9 +91,27 @@ def run(options: argparse.Namespace) -> None:
     print_results(facts, notes, out / page.name)
 
 
+def rotating(options: argparse.Namespace) -> None:
+    """Fit every half turn of a rotating polarizer, write the files and print facts about the input and the result."""
+    rotation = rotation_of(options.rate, options.triggers, options.start_angle)
+    step_us = duration_us(options, "step", "10ms")
+    source, rotation = open_rotating(options.input, rotation, functools.partial(open_recording, **reading_of(options)))
+    rule = WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
+    method = METHODS[ROTATING_METHOD]
+    recoverer = method.open(replace(setup_of(load(settings_root()), method), rotation=rotation))
+    out = options.out or Path("outputs") / "recover" / options.input.name
+    with run_folder(out, "recover-rotating") as folder:
+        writer = RecoveryWriter(folder, OUTPUTS)
+        words = f"{method.name}, {rotation.rate_hz:g} turns/s"
+        facts = recover(source, rule, words, writer, frames_of(source, rule, recoverer))
+        notes = damage(source)
+        page = writer.write_page(source.name, {"command": options.command_line, **facts}, notes)
+    print_results(facts, notes, out / page.name)
+
+
 def damage(source: Input) -> list[str]:
     """A sentence for each kind of unusable events in each file that was read."""
-    kinds = [(name, kind, count) for name, repairs in source.repairs.items() for kind, count in repairs.items()]
+    kinds = [(name, kind, count) for name, repairs in source.repairs for kind, count in repairs.items()]
     return [f"{name}: {count:,} {REPAIRS[kind]}." for name, kind, count in kinds if count and kind not in HARMLESS]
 
 
@@ -116,11 +136,12 @@ def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Se
 def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner) -> Input:
     """Cleaned events of live input, or of files with the arrangement that the options state."""
     if options.live:
-        return open_live(options.input[0], mosaic, options.idle, cleaner)
-    open_file = functools.partial(open_recording, **reading_of(options))
-    paths = [Path(path) for path in options.input]
-    channels = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
-    return input_of(", ".join(path.name for path in paths), channels, cleaner)
+        source = open_live(options.input[0], mosaic, options.idle)
+    else:
+        open_file = functools.partial(open_recording, **reading_of(options))
+        paths = [Path(path) for path in options.input]
+        source = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
+    return source._replace(pieces=cleaner.clean(source.pieces, live=source.live))
 
 
 def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFrames | None:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32
 from torch import Tensor
 
 from polarnet import stokes
@@ -92,16 +91,24 @@ def write_simulation(
                 raise ValueError(f"expected at most {MAX_DURATION_US / 6e7:.0f} minutes, got more; cut the clip")
             spool.append(piece.events)
             for t_us, frame in zip(piece.t_us.tolist(), piece.stokes, strict=True):
-                values = _true_frame(t_us, frame)
-                polarized |= bool(values["dolp"].any())
-                truth.add(values)
+                dolp = quantise("dolp", stokes.dolp(frame).clamp(0, 1))
+                s0, aolp = quantise("s0", frame[0].clamp(0, 1)), quantise("aolp", stokes.aolp(frame))
+                polarized |= bool(dolp.any())
+                truth.add({"t_us": np.array(t_us, np.int64), "s0": s0, "dolp": dolp, "aolp": aolp})
             frames += len(piece.t_us)
             bar.update(len(piece.t_us))
     truth.flush()
     if duration_us == 0:
         raise ValueError("expected at least two frames, got one: nothing changes, so no pixel fires")
     channels = leave_sensors(spool.channels(), camera, duration_us)
-    files = [*_write_events(channels, camera, duration_us, output), *_write_preview(channels, output), TRUTH]
+    files = _write_events(channels, camera, duration_us, output)
+    if output.gamma is not None:
+        frames_on_disk = open_truth(output.folder / TRUTH, "")
+        busiest = write_true_video(output.folder / VIDEO, channels, frames_on_disk, gamma=output.gamma)
+        if busiest is not None:
+            (output.folder / PICTURE).write_bytes(encode_png(busiest))
+            files += [VIDEO, PICTURE]
+    files.append(TRUTH)
     shutil.rmtree(spool.folder)
     counts = dict(zip(stokes.POLARIZER_ANGLES_DEG, map(len, channels), strict=True))
     events, seconds = sum(counts.values()), duration_us * 1e-6
@@ -117,15 +124,6 @@ def write_simulation(
     if total is not None and frames < total:
         notes.append(f"the file states {total:,} frames, {frames:,} could be read")
     return facts, notes
-
-
-def _true_frame(t_us: int, frame: Float32[Tensor, "3 h w"]) -> dict[str, np.ndarray]:
-    return {
-        "t_us": np.array(t_us, np.int64),
-        "s0": quantise("s0", frame[0].clamp(0, 1)),
-        "dolp": quantise("dolp", stokes.dolp(frame).clamp(0, 1)),
-        "aolp": quantise("aolp", stokes.aolp(frame)),
-    }
 
 
 def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, output: Output) -> list[str]:
@@ -150,15 +148,3 @@ def _write_events(channels: Sequence[Events], camera: Camera, duration_us: int, 
             write(output.folder / f"{sensor}{suffix}", events)
             files.append(f"{sensor}{suffix}")
     return files
-
-
-def _write_preview(channels: Sequence[Events], output: Output) -> list[str]:
-    """Write a video with one picture for the events between two true frames, and its busiest picture."""
-    if output.gamma is None:
-        return []
-    truth = open_truth(output.folder / TRUTH, "")
-    busiest = write_true_video(output.folder / VIDEO, channels, truth, gamma=output.gamma)
-    if busiest is None:
-        return []
-    (output.folder / PICTURE).write_bytes(encode_png(busiest))
-    return [VIDEO, PICTURE]

@@ -3,7 +3,6 @@
 import fnmatch
 import functools
 import json
-import math
 import re
 import subprocess
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import Node
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from polarnet.runtime.files import replaced
@@ -98,7 +96,9 @@ def changed_values(root: Path) -> list[str]:
     In a project without git: from those that came with polarnet.
     """
     values, base = _flat(YAML(typ="safe").load(root / "params.yaml")), _original_values(root)
-    return [f"{key}={_as_override(value)}" for key, value in values.items() if key not in base or base[key] != value]
+    changed = {key: value for key, value in values.items() if key not in base or base[key] != value}
+    # JSON without quotes is what Hydra reads
+    return [f"{key}={json.dumps(value, ensure_ascii=False)}".replace('"', "") for key, value in changed.items()]
 
 
 def _original_values(root: Path) -> dict[str, Any]:
@@ -106,11 +106,6 @@ def _original_values(root: Path) -> dict[str, Any]:
     committed = subprocess.run(["git", "show", "HEAD:./params.yaml"], cwd=root, capture_output=True, text=True)
     original = shipped_settings() / "params.yaml" if committed.returncode else committed.stdout
     return _flat(YAML(typ="safe").load(original))
-
-
-def _as_override(value: Any) -> str:
-    """A value as Hydra reads it: JSON without quotes."""
-    return json.dumps(value, ensure_ascii=False).replace('"', "")
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -145,8 +140,12 @@ def _check_params(settings: type, file: Path) -> None:
     try:
         text, yaml = file.read_text(encoding="utf-8"), YAML(typ="safe", pure=True)
         root = yaml.compose(text)
-        if (values := _values_of(root)) > MAX_VALUES:
-            raise ValueError(f"expected at most {MAX_VALUES} values, {MAX_DEPTH} deep, its aliases make {values:g}")
+        nodes = [] if root is None else [(0, root)]
+        for depth, node in nodes:  # grows while it is read, every alias written out
+            items = node.value if isinstance(node.value, list) else []
+            nodes += [(depth + 1, part) for item in items for part in (item if isinstance(item, tuple) else (item,))]
+            if len(nodes) > MAX_VALUES or depth > MAX_DEPTH:
+                raise ValueError(f"expected at most {MAX_VALUES} values, {MAX_DEPTH} deep, its aliases make more")
         content = None if root is None else yaml.constructor.construct_document(root)
         if not isinstance(content, dict):
             raise ValueError("expected sections")
@@ -158,22 +157,6 @@ def _check_params(settings: type, file: Path) -> None:
     for key in content:
         if refusal := unknown_key(settings, [str(key)]):
             raise ValueError(f"{file}: {refusal}")
-
-
-def _values_of(root: Node | None) -> int | float:
-    """Number of values below a node, with every alias written out: a few lines can make billions."""
-    sizes: dict[int, int | float] = {}
-
-    def size(node: Node, depth: int = 0) -> int | float:
-        if id(node) not in sizes:
-            sizes[id(node)] = math.inf  # for an alias of a node inside itself
-            items = node.value if isinstance(node.value, list) else []
-            parts = (part for item in items for part in (item if isinstance(item, tuple) else (item,)))
-            if depth < MAX_DEPTH:
-                sizes[id(node)] = 1 + sum(size(part, depth + 1) for part in parts)
-        return sizes[id(node)]
-
-    return 0 if root is None else size(root)
 
 
 def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:

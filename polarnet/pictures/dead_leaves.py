@@ -5,12 +5,12 @@ natural pictures (Lee, Mumford and Huang, "Occlusion models for natural images",
 """
 
 import math
-from typing import no_type_check
 
 import cv2
-import numba
 import numpy as np
 from jaxtyping import Float32
+
+from polarnet.runtime.compilation import compiled, inlined
 
 COVERINGS = 5.0  # summed area of the shapes over that of the picture; exp(-5) of it stays uncovered
 RADIUS_MIN_PX = (10.0, 32.0)  # range from which each picture draws the radius of its smallest leaves
@@ -141,17 +141,11 @@ def _noise_tile(generator: np.random.Generator) -> Float32[np.ndarray, "n n"]:
     return (tile / tile.std()).astype(np.float32)
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True)
-def _paint(
-    picture: Float32[np.ndarray, "h w 3"],
-    uncovered: Float32[np.ndarray, "h w"],
-    leaves: np.ndarray,
-    noise: Float32[np.ndarray, "n n"],
-) -> None:
+@compiled
+def _paint(picture, uncovered, leaves, noise):
     """Add the leaves to a black picture, from the topmost (the last) down; rims are blended over one pixel.
 
-    `uncovered` is the share of each pixel that no leaf covers yet; at 0 the pixel is complete.
+    `picture` is float32 [h, w, 3]; `uncovered`, float32 [h, w], is the share of each pixel that no leaf covers yet.
     """
     height, width = uncovered.shape
     for i in range(len(leaves) - 1, -1, -1):
@@ -174,9 +168,8 @@ def _paint(
                 uncovered[row, column] = visible - visible * cover if visible * (1 - cover) > HIDDEN else 0
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _outside_px(leaf, dx: float, dy: float) -> float:
+@inlined
+def _outside_px(leaf, dx, dy):
     """Distance of a point (from the leaf's centre) beyond the rim in pixels, to first order; negative inside."""
     x = (leaf.cos * dx + leaf.sin * dy) / leaf.radius
     y = (leaf.cos * dy - leaf.sin * dx) / leaf.radius
@@ -191,9 +184,8 @@ def _outside_px(leaf, dx: float, dy: float) -> float:
     return leaf.radius * furthest
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _colour(leaf, dx: float, dy: float, noise) -> tuple[float, float, float]:
+@inlined
+def _colour(leaf, dx, dy, noise):
     """Hue in turns, saturation and value of a leaf at a point: its colour, shaded along one axis, plus its texture."""
     shade = (leaf.shade_cos * dx + leaf.shade_sin * dy) / leaf.radius
     pattern = 0.0
@@ -207,9 +199,8 @@ def _colour(leaf, dx: float, dy: float, noise) -> tuple[float, float, float]:
     return hue, saturation, value
 
 
-@no_type_check
-@numba.njit(cache=True, nogil=True, inline="always")
-def _noise_at(noise, x: float, y: float) -> float:
+@inlined
+def _noise_at(noise, x, y):
     """Bilinear sample of the periodic tile."""
     left, top = math.floor(x), math.floor(y)
     fx, fy = x - left, y - top

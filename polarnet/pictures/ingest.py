@@ -31,6 +31,8 @@ logger = logging.getLogger(__name__)
 EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
+Read = tuple[str, Callable[[Path], None], dict[str, Any]]
+"""A picture's suffix in data/images, the function that writes it there, and fields of its `ManifestEntry`."""
 
 
 @section
@@ -68,10 +70,10 @@ class IngestConfig:
 
 @dataclass(frozen=True)
 class Source:
-    """One picture to read, with its origin."""
+    """One picture to read or to generate, with its origin."""
 
-    files: tuple[Path, ...]  # four if each polarizer angle has a file, else one
-    kind: str  # photograph, folder or polarization
+    files: tuple[Path, ...]  # four if each polarizer angle has a file, none for a generated picture, else one
+    kind: str  # photograph, dead_leaves, folder or polarization
     stem: str
     origin: str
     licence: str | None = None
@@ -89,36 +91,34 @@ def ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Man
     with claimed(folder):
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        builtin = config.source == "builtin"
-        manifest = (_ingest_builtin if builtin else _ingest_folder)(config, seed, temporary, mapper)
+        manifest = _ingest(config, seed, temporary, mapper)
         for skipped in manifest.skipped:
             logger.warning("skipped %s: %s", skipped.file, skipped.reason)
-        _check_not_empty(config, manifest)
+        _warn_of_empty_splits(config, manifest)
         write_manifest(manifest, temporary)
         publish(temporary, folder)
     return manifest
 
 
-def _ingest_builtin(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    sources = [
+def _builtin_sources(config: IngestConfig, seed: int) -> tuple[list[Source], int]:
+    """The builtin photographs and the pictures to generate; no other files."""
+    photographs = [
         Source((photo.path,), "photograph", photo.path.stem, photo.origin, photo.licence, photo.author)
         for photo in BUILTIN_PHOTOS
     ]
-    photographs = list(mapper(functools.partial(_convert, config=config, folder=folder), list(enumerate(sources))))
-    make = functools.partial(_make_dead_leaves, config=config, seed=seed, folder=folder)
-    generated = list(mapper(make, range(config.dead_leaves)))
-    entries, skipped = _without_duplicates([*photographs, *generated])
-    groups = [[entry for entry in entries if entry.source == kind] for kind in ("photograph", "dead_leaves")]
-    return _manifest([entry for group in groups for entry in _split(config, group)], skipped, folder)
+    stems, origin = [f"dead-leaves-{number:04d}" for number in range(config.dead_leaves)], f"generated from seed {seed}"
+    return photographs + [Source((), "dead_leaves", stem, origin, "CC0-1.0", "polarnet") for stem in stems], 0
 
 
-def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mapper) -> Manifest:
-    """Read all pictures, or with a `limit` that many, in the order of the hashes of their files."""
-    sources, ignored = _find_pictures(Path(config.root), config.source)
-    if config.limit is not None:
+def _ingest(config: IngestConfig, seed: int, folder: Path, mapper: Mapper) -> Manifest:
+    """Read all pictures, or of a folder with a `limit` that many, in the order of the hashes of their files."""
+    builtin = config.source == "builtin"
+    sources, ignored = _builtin_sources(config, seed) if builtin else _find_pictures(config)
+    limit = None if builtin else config.limit
+    if limit is not None:
         sources.sort(key=lambda source: _edge_hash(source.files))
-    limit = config.limit or len(sources)
-    convert = functools.partial(_CONVERTERS[config.source], config=config, folder=folder)
+    limit = limit or len(sources)
+    convert = functools.partial(_convert, config=config, seed=seed, folder=folder)
     entries: list[ManifestEntry] = []
     skipped: list[Skipped] = []
     outcomes: list[ManifestEntry | Skipped] = []
@@ -126,18 +126,21 @@ def _ingest_folder(config: IngestConfig, _seed: int, folder: Path, mapper: Mappe
         batch = list(enumerate(sources))[len(outcomes) : len(outcomes) + limit - len(entries)]
         outcomes.extend(mapper(convert, batch))
         entries, skipped = _without_duplicates(outcomes)
+    if not entries and builtin:
+        raise ValueError("ingest.source=builtin: no picture is left; raise ingest.dead_leaves")
     if not entries:
         raise ValueError(
             f"ingest.root={config.root}: no picture could be used. Looked, in all subfolders, for files that end in "
             f"{', '.join(sorted(_extensions(config.source)))}: found {len(sources)} pictures and {ignored} other files."
             f"{listed(skipped)}"
         )
-    manifest = _manifest(_split(config, entries), skipped, folder)
-    return dataclasses.replace(manifest, ignored_files=ignored, unread_files=len(sources) - len(outcomes))
+    skipped.sort(key=lambda skip: skip.file)
+    return Manifest(_named(entries, config, folder), tuple(skipped), ignored, len(sources) - len(outcomes))
 
 
-def _find_pictures(root: Path, kind: str) -> tuple[list[Source], int]:
-    """Files under `root` with a picture's extension, by path, and the number of other files."""
+def _find_pictures(config: IngestConfig) -> tuple[list[Source], int]:
+    """Files under `ingest.root` with a picture's extension, by path, and the number of other files."""
+    root, kind = Path(config.root), config.source
     if not root.is_dir():
         raise ValueError(f"ingest.root: expected a folder with pictures, got {root}; see ingest.source")
     files = [path for path in files_under(root) if path.is_file() or path.is_symlink()]  # a dead link is skipped later
@@ -186,67 +189,61 @@ def _edge_hash(files: Sequence[Path]) -> str:
     return digest.hexdigest()
 
 
-def _convert(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, cut and scale one file to `folder`/source-<number>, or return the reason why not.
-
-    Linear light in floating-point numbers stays as it is, in a .npy file. Other pictures become sRGB in a .png file.
-    """
+def _convert(item: tuple[int, Source], config: IngestConfig, seed: int, folder: Path) -> ManifestEntry | Skipped:
+    """Read or generate one picture as `folder`/source-<number>, or return the reason why not."""
     number, source = item
     try:
-        picture = images.read_picture(source.files[0])
-        pixels = images.light_of(picture.pixels) if picture.light else picture.pixels
-        fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
-        rgb = fitted if picture.light else images.srgb_of(fitted, picture)
+        suffix, write, about = _READERS[source.kind](source, config, seed)
     except UnreadablePicture as error:
-        return Skipped(source.origin if source.kind == "folder" else source.files[0].name, str(error))
-    file = f"source-{number:08d}{images.LIGHT if picture.light else '.png'}"
+        return Skipped(source.files[0].name if source.kind == "photograph" else source.origin, str(error))
+    file = f"source-{number:08d}{suffix}"
+    write(folder / file)
+    given: dict[str, Any] = {"licence": source.licence, "author": source.author}
+    size: dict[str, Any] = {"height": config.height, "width": config.width}
+    name = f"{_slug(source.stem)}-{about['sha256'][:8]}"
+    return ManifestEntry(name=name, file=file, source=source.kind, origin=source.origin, **(given | size | about))
+
+
+def _read_photograph(source: Source, config: IngestConfig, _seed: int) -> Read:
+    """Cut and scale a picture. Linear light in floating-point numbers stays as it is, other pictures become sRGB."""
+    picture = images.read_picture(source.files[0])
+    pixels = images.light_of(picture.pixels) if picture.light else picture.pixels
+    fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
+    about = {"sha256": picture.sha256, "licence": source.licence or picture.licence,
+             "author": source.author or picture.author}  # fmt: skip
     if picture.light:
-        np.save(folder / file, rgb)
-    else:
-        write_png(folder / file, rgb, picture.bits)
-    return ManifestEntry(
-        name=f"{_slug(source.stem)}-{picture.sha256[:8]}", file=file, source=source.kind, origin=source.origin,
-        licence=source.licence or picture.licence, author=source.author or picture.author, sha256=picture.sha256,
-        height=config.height, width=config.width,
-    )  # fmt: skip
+        return images.LIGHT, functools.partial(np.save, arr=fitted), about
+    return ".png", functools.partial(write_png, rgb=images.srgb_of(fitted, picture), bits=picture.bits), about
 
 
-def _convert_polarization(item: tuple[int, Source], config: IngestConfig, folder: Path) -> ManifestEntry | Skipped:
-    """Read, check and shrink one measurement to `folder`/source-<number>.npz, or return the reason why not."""
-    number, source = item
-    try:
-        measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic), config.white)
-        if measured.residual > config.residual_max:
-            raise UnreadablePicture(
-                f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, above "
-                f"ingest.residual_max={config.residual_max:g}; is an angle, linearity or ingest.mosaic wrong?"
-            )
-    except UnreadablePicture as error:
-        return Skipped(source.origin, str(error))
+def _read_polarization(source: Source, config: IngestConfig, _seed: int) -> Read:
+    """Check and shrink a measurement."""
+    measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic), config.white)
+    if measured.residual > config.residual_max:
+        raise UnreadablePicture(
+            f"the angles do not fit: the median of |I0 + I90 - I45 - I135| / S0 is {measured.residual:.4f}, above "
+            f"ingest.residual_max={config.residual_max:g}; is an angle, linearity or ingest.mosaic wrong?"
+        )
     shrunk = polarimetry.shrink(measured, config.height, config.width)
-    file = f"source-{number:08d}.npz"
-    polarimetry.write_intensities(folder / file, shrunk)
-    digest = sha256(measured.intensities.tobytes(), measured.valid.tobytes())
     height, width = shrunk.valid.shape
-    return ManifestEntry(
-        name=f"{_slug(source.stem)}-{digest[:8]}", file=file, source=source.kind, origin=source.origin, sha256=digest,
-        height=height, width=width, residual=round(measured.residual, 6),
-        saturated_fraction=round(measured.saturated, 6), masked_fraction=round(float(1 - shrunk.valid.mean()), 6),
-    )  # fmt: skip
+    return ".npz", functools.partial(polarimetry.write_intensities, measurement=shrunk), {
+        "sha256": sha256(measured.intensities.tobytes(), measured.valid.tobytes()), "height": height, "width": width,
+        "residual": round(measured.residual, 6), "saturated_fraction": round(measured.saturated, 6),
+        "masked_fraction": round(float(1 - shrunk.valid.mean()), 6),
+    }  # fmt: skip
 
 
-_CONVERTERS = {"folder": _convert, "polarization": _convert_polarization}
-
-
-def _make_dead_leaves(number: int, config: IngestConfig, seed: int, folder: Path) -> ManifestEntry:
-    stem = f"dead-leaves-{number:04d}"
-    rgb = dead_leaves(generator_for(seed, stem, "picture"), config.height, config.width)
-    write_png(folder / f"{stem}.png", rgb, bits=8)
+def _generate_dead_leaves(source: Source, config: IngestConfig, seed: int) -> Read:
+    rgb = dead_leaves(generator_for(seed, source.stem, "picture"), config.height, config.width)
     digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
-    return ManifestEntry(
-        name=f"{stem}-{digest[:8]}", file=f"{stem}.png", source="dead_leaves", origin=f"generated from seed {seed}",
-        licence="CC0-1.0", author="polarnet", sha256=digest, height=config.height, width=config.width,
-    )  # fmt: skip
+    return ".png", functools.partial(write_png, rgb=rgb, bits=8), {"sha256": digest}
+
+
+_READERS: dict[str, Callable[[Source, IngestConfig, int], Read]] = {
+    "photograph": _read_photograph, "dead_leaves": _generate_dead_leaves, "folder": _read_photograph,
+    "polarization": _read_polarization,
+}  # fmt: skip
+"""Readers by kind of source, in the order in which the kinds are split."""
 
 
 def _without_duplicates(outcomes: list[ManifestEntry | Skipped]) -> tuple[list[ManifestEntry], list[Skipped]]:
@@ -263,28 +260,22 @@ def _without_duplicates(outcomes: list[ManifestEntry | Skipped]) -> tuple[list[M
     return list(first.values()), skipped
 
 
-def _split(config: IngestConfig, group: Sequence[ManifestEntry]) -> list[ManifestEntry]:
-    splits = split_by_content([entry.sha256 for entry in group], config.val_fraction, config.test_fraction)
-    return [dataclasses.replace(entry, split=split) for entry, split in zip(group, splits, strict=True)]
-
-
-def _manifest(entries: Sequence[ManifestEntry], skipped: Sequence[Skipped], folder: Path) -> Manifest:
-    """The manifest of entries whose files get their final names here; files without an entry are removed."""
+def _named(entries: Sequence[ManifestEntry], config: IngestConfig, folder: Path) -> tuple[ManifestEntry, ...]:
+    """Entries by name, each kind split on its own; files get their final names, and those without an entry leave."""
     named = []
-    for entry in entries:
-        file = f"{entry.name}{Path(entry.file).suffix}"
-        (folder / entry.file).rename(folder / file)
-        named.append(dataclasses.replace(entry, file=file))
-    for path in folder.iterdir():
-        if path.name not in {entry.file for entry in named}:
-            path.unlink()
-    pictures = tuple(sorted(named, key=lambda entry: entry.name))
-    return Manifest(pictures, tuple(sorted(skipped, key=lambda skip: skip.file)), ignored_files=0, unread_files=0)
+    for kind in _READERS:
+        group = [entry for entry in entries if entry.source == kind]
+        splits = split_by_content([entry.sha256 for entry in group], config.val_fraction, config.test_fraction)
+        for entry, split in zip(group, splits, strict=True):
+            file = f"{entry.name}{Path(entry.file).suffix}"
+            (folder / entry.file).rename(folder / file)
+            named.append(dataclasses.replace(entry, file=file, split=split))
+    for path in {*folder.iterdir()} - {folder / entry.file for entry in named}:
+        path.unlink()
+    return tuple(sorted(named, key=lambda entry: entry.name))
 
 
-def _check_not_empty(config: IngestConfig, manifest: Manifest) -> None:
-    if not manifest.pictures:
-        raise ValueError(f"ingest.source={config.source}: no picture is left; raise ingest.dead_leaves")
+def _warn_of_empty_splits(config: IngestConfig, manifest: Manifest) -> None:
     val, test = config.val_fraction, config.test_fraction
     for split, fraction in (("train", 1 - val - test), ("val", val), ("test", test)):
         if fraction > 0 and not manifest.counts[split]:

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ import numpy as np
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events, shifted, slice_count
 from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
-from polarnet.recordings.source import RecordingError
+from polarnet.recordings.source import Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 
 Open = Callable[[Path], RecordingReader]
@@ -34,22 +35,46 @@ class Piece(NamedTuple):
     """When its first data arrived, by `time.perf_counter`."""
 
 
-@dataclass(frozen=True)
-class Channels:
-    """Channels of one size, in pieces; each iteration starts from the beginning.
+class Input(NamedTuple):
+    """Events of channels of equal size, piece by piece."""
 
-    RecordingError while iterating, where a file turns out to be damaged.
-    """
-
+    name: str
     height: int
     width: int
-    blocks: Callable[[], Iterator[Sequence[Events]]]
-    """The events of all channels in blocks, each with no event before the last one of the previous block."""
-    readers: Sequence[RecordingReader] = ()
-    """Files behind the channels, whose `repairs` are complete after an iteration."""
+    pieces: Iterable[Piece]
+    """Those of files can be read again from the start; RecordingError where a file turns out to be damaged."""
+    repairs: Sequence[tuple[str, Counts]] = ()
+    """Unusable events of each file by kind (`polarnet.recordings.source.REPAIRS`), counted while `pieces` are read."""
+    channels: int = len(POLARIZER_ANGLES_DEG)
+    """4, or 1 for a camera without polarizers or behind a rotating one."""
+    live: bool = False
+    """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
+    waits: bool = True
+    """Whether the source waits until it is read. Windows of a live one that does not are joined if need be."""
+
+    def shares_read(self) -> dict[str, str]:
+        """The part of the files that is read, in words; empty where their formats do not tell."""
+        shares = [counts.share_read for _, counts in self.repairs]
+        return {"read": f"{sum(shares) / len(shares):.0%}"} if any(shares) else {}
+
+    def whole(self) -> list[Events]:
+        """All events; logs a warning for each kind of damage."""
+        channels = whole((piece.channels for piece in self.pieces), self.height, self.width, self.channels)
+        for name, counts in self.repairs:
+            log_repairs(name, counts)
+        return channels
+
+
+Blocks = Callable[[], Iterator[Sequence[Events]]]
+"""Reads the events of all channels in blocks, each with no event before the last one of the previous block."""
+
+
+@dataclass(frozen=True)
+class FilePieces:
+    """Pieces of files, again at each iteration; time 0 is `origin_us` (None: the first event)."""
+
+    blocks: Blocks
     origin_us: int | None = None
-    """Time 0 by the clock of `blocks`; None: their first event."""
-    number: int = len(POLARIZER_ANGLES_DEG)
 
     def __iter__(self) -> Iterator[Piece]:
         piece = None
@@ -59,12 +84,10 @@ class Channels:
             nothing = [slice_count(events, 0, 0) for events in piece.channels]
             yield Piece(nothing, piece.until_us + 1, time.perf_counter())
 
-    def whole(self) -> list[Events]:
-        """All events; logs a warning for each kind of damage."""
-        channels = whole((piece.channels for piece in self), self.height, self.width, self.number)
-        for reader in self.readers:
-            log_repairs(reader)
-        return channels
+
+def _files(readers: Sequence[RecordingReader], name: str, height: int, width: int, blocks: Blocks) -> Input:
+    repairs = [(reader.path.name, reader.repairs) for reader in readers]
+    return Input(name, height, width, FilePieces(blocks), repairs)
 
 
 def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int | None = None) -> Iterator[Piece]:
@@ -78,7 +101,7 @@ def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int |
             yield Piece([shifted(events, origin_us) for events in channels], until_us, read_at)
 
 
-def open_four(files: Mapping[int, str | os.PathLike[str]], open_file: Open = open_recording) -> Channels:
+def open_four(files: Mapping[int, str | os.PathLike[str]], open_file: Open = open_recording) -> Input:
     """The channels of `read_four`, in pieces."""
     by_angle = {angle % 180: angle for angle in files}
     if sorted(by_angle) != list(POLARIZER_ANGLES_DEG) or len(by_angle) != len(files):
@@ -87,8 +110,8 @@ def open_four(files: Mapping[int, str | os.PathLike[str]], open_file: Open = ope
     sizes = {(reader.height, reader.width) for reader in readers}
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
-    nothing = Events.empty(*sizes.pop())
-    return Channels(nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing), readers)
+    nothing, name = Events.empty(*sizes.pop()), ", ".join(Path(path).name for path in files.values())
+    return _files(readers, name, nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing))
 
 
 def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[list[Events]]:
@@ -118,13 +141,12 @@ def read_four(files: Mapping[int, str | os.PathLike[str]]) -> list[Events]:
     return open_four(files).whole()
 
 
-def open_mosaic(path: str | os.PathLike[str], mosaic: Mosaic, open_file: Open = open_recording) -> Channels:
+def open_mosaic(path: str | os.PathLike[str], mosaic: Mosaic, open_file: Open = open_recording) -> Input:
     """The channels of `read_mosaic`, in pieces."""
     reader = open_file(Path(path))
-    channel = split_mosaic(Events.empty(reader.height, reader.width), mosaic)[0]
-    return Channels(
-        channel.height, channel.width, lambda: (split_mosaic(events, mosaic) for events in reader), [reader]
-    )
+    one = split_mosaic(Events.empty(reader.height, reader.width), mosaic)[0]
+    blocks = partial(map, partial(split_mosaic, mosaic=mosaic), reader)
+    return _files([reader], reader.path.name, one.height, one.width, blocks)
 
 
 def read_mosaic(path: str | os.PathLike[str], mosaic: Mosaic) -> list[Events]:
@@ -139,7 +161,8 @@ def read_mosaic(path: str | os.PathLike[str], mosaic: Mosaic) -> list[Events]:
     return open_mosaic(path, mosaic).whole()
 
 
-def open_plain(path: Path, open_file: Open = open_recording) -> Channels:
+def open_plain(path: Path, open_file: Open = open_recording) -> Input:
     """One channel in pieces: all events of a camera without polarizers."""
     reader = open_file(path)
-    return Channels(reader.height, reader.width, lambda: ([events] for events in reader), [reader], number=1)
+    source = _files([reader], path.name, reader.height, reader.width, lambda: ([events] for events in reader))
+    return source._replace(channels=1)

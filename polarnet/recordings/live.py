@@ -15,10 +15,10 @@ import re
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from queue import Empty, Queue
 from threading import Thread
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from jaxtyping import Int64
 
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import MAX_SIDE, Events
-from polarnet.recordings.arrangements import Piece, pieces_of
+from polarnet.recordings.arrangements import Input, pieces_of
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import Clock, refuse_much_damage, usable
 from polarnet.recordings.source import SAFE, Block, Counts, RecordingError
@@ -41,13 +41,16 @@ MAX_WAIT_S = 0.02  # events whose times later ones must confirm wait no longer, 
 SCHEME, CAMERA = "dv://", "camera"
 NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")
 
+Table: TypeAlias = Int64[np.ndarray, "n columns"]
+Lines: TypeAlias = Iterator[tuple[bytes, float]]
+Arrivals: TypeAlias = Queue[tuple[bytes, float] | None]
+
 
 class _Stream:
     """Makes blocks of four channels from the events of a mosaic, or of four sensors, as they arrive."""
 
     def __init__(self, name: str, height: int, width: int, mosaic: Mosaic | None):
-        self.height, self.width = (side // 2 if mosaic else side for side in (height, width))
-        self.counts = Counts()
+        self.name, self.counts = name, Counts()
         self._sensor, self._mosaic = (height, width), mosaic
         self._clock = Clock(name, self.counts, live=True)
         self._since = 0.0
@@ -56,12 +59,16 @@ class _Stream:
         """Seconds until the events that are held back are to be flushed; None if there are none."""
         return max(0.0, self._since + MAX_WAIT_S - time.perf_counter()) if self._clock.waiting else None
 
-    def add(
-        self, table: Int64[np.ndarray, "n columns"], read_at: float, *, flush: bool = False
-    ) -> Iterator[tuple[list[Events], float]]:
+    def input(self, tables: Iterable[tuple[Table | None, float]], *, waits: bool) -> Input:
+        """Tables and their times of arrival as an input; None where events were held back for long enough."""
+        height, width = (side // 2 if self._mosaic else side for side in self._sensor)
+        blocks = itertools.chain.from_iterable(self._add(*one) for one in itertools.chain(tables, [(None, 0.0)]))
+        return Input(self.name, height, width, pieces_of(blocks), [(self.name, self.counts)], live=True, waits=waits)
+
+    def _add(self, table: Table | None, read_at: float) -> Iterator[tuple[list[Events], float]]:
         """Channels of the next rows `t x y p` or `t x y p angle`, and the time of arrival of the first of them."""
         self._since = self._since if self._clock.waiting else read_at
-        t, x, y, p, *angle = table.T
+        t, x, y, p, *angle = np.empty((4, 0), np.int64) if table is None else table.T
         good = usable(Block(t, x, y, np.where(p == -1, 0, p)), *self._sensor, 0, self.counts)
         p = np.where(p > 0, 1, -1)
         if angle:
@@ -71,7 +78,7 @@ class _Stream:
             good &= known
             p *= 1 + channel  # the clock sorts the columns of `Block` alone, so p holds the channel too
         x, y, p = (column[good].astype(dtype) for column, dtype in ((x, np.int16), (y, np.int16), (p, np.int8)))
-        for ready in self._clock.ordered(Block(t[good], x, y, p), final=flush):
+        for ready in self._clock.ordered(Block(t[good], x, y, p), final=table is None):
             if len(ready.t):
                 yield self._channels(ready), self._since
 
@@ -86,134 +93,114 @@ class _Stream:
         return Events(t, x, y, p.sign(), *self._sensor)
 
 
-class LiveLines:
-    """Read lines as they arrive, in pieces; ends with the input.
+def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
+    """Read lines as they arrive, up to the end of the source, which is closed unless it is standard input.
 
-    Unusable lines and events with wrong times are left out and counted in `counts`. RecordingError where more than 1 %
-    of the lines (and 8) are unusable for the same reason, or where the first line is not a size. The source is closed
-    at its end, unless it is standard input.
+    Unusable lines and events with wrong times are left out and counted. RecordingError where more than 1 % of the lines
+    (and 8) are unusable for the same reason, or where the first line is not a size.
     """
+    waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
+    queue: Arrivals = Queue(MAX_READ_AHEAD // (READ_BYTES if waits else PIPE_BYTES))
+    own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
+    Thread(target=_read, args=[source, own, queue], daemon=True).start()
+    stream: _Stream | None = None
+    (width, height), lines = _size(name, _whole_lines(queue, lambda: stream.patience_s() if stream else None))
+    stream = _Stream(name, height, width, mosaic)
 
-    def __init__(self, source: BinaryIO, name: str, mosaic: Mosaic | None):
-        self.name = name
-        self._source, self._columns = source, 4 if mosaic else 5
-        self.waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-        self._queue: Queue[tuple[bytes, float] | None] = Queue(
-            MAX_READ_AHEAD // (READ_BYTES if self.waits else PIPE_BYTES)
-        )
-        own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
-        Thread(target=self._read, args=[own], daemon=True).start()
-        self._stream: _Stream | None = None
-        self._lines = self._whole_lines()
-        self._sensor = self._size()
-        self._stream = _Stream(name, *self._sensor, mosaic)
-        self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
+    def tables() -> Iterator[tuple[Table | None, float]]:
+        shift, number = np.zeros(4 if mosaic else 5, np.int64), 0
+        for data, read_at in lines:
+            number += data.count(b"\n")
+            rows = [np.empty((0, len(shift)), np.int64), *rows_of(data, shift, stream.counts, "unreadable_lines")]
+            yield np.concatenate(rows) if data else None, read_at
+            refuse_much_damage(name, stream.counts, number, (*SAFE, "time_glitches"))
 
-    def __iter__(self) -> Iterator[Piece]:
-        return pieces_of(self._blocks())
+    return stream.input(tables(), waits=waits)
 
-    def _blocks(self) -> Iterator[tuple[list[Events], float]]:
-        assert self._stream is not None
-        shift, lines = np.zeros(self._columns, np.int64), 0
-        nothing = np.empty((0, self._columns), np.int64)
-        for data, read_at in self._lines:
-            rows = [nothing, *rows_of(data, shift, self.counts, "unreadable_lines")]
-            lines += data.count(b"\n")
-            blocks = list(self._stream.add(np.concatenate(rows), read_at, flush=not data))
-            refuse_much_damage(self.name, self.counts, lines, (*SAFE, "time_glitches"))
-            yield from blocks
-        yield from self._stream.add(nothing, 0.0, flush=True)
 
-    def _size(self) -> tuple[int, int]:
-        """Height and width in the first line that is no comment; what has arrived after it stays in `_lines`."""
-        line = b""
-        while not line.partition(b"#")[0].strip():
-            data, read_at = next(self._lines, (b"", 0.0))
-            if not data:
-                break
-            line, _, rest = data.partition(b"\n")
-            self._lines = itertools.chain([(rest, read_at)] if rest else [], self._lines)
-        words = [word for one in numbers_of(line) for word in one.words]
-        if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
-            raise RecordingError(f"{self.name}: expected a first line `width height` of the sensor, such as `346 260`")
-        return int(words[1]), int(words[0])
+def _size(name: str, lines: Lines) -> tuple[list[int], Lines]:
+    """Width and height in the first line that is no comment, and the lines after it."""
+    line = b""
+    while not line.partition(b"#")[0].strip():
+        data, read_at = next(lines, (b"", 0.0))
+        if not data:
+            break
+        line, _, rest = data.partition(b"\n")
+        lines = itertools.chain([(rest, read_at)] if rest else [], lines)
+    words = [word for one in numbers_of(line) for word in one.words]
+    if len(words) != 2 or not all(w.isdigit() and 0 < int(w) <= MAX_SIDE for w in words):
+        raise RecordingError(f"{name}: expected a first line `width height` of the sensor, such as `346 260`")
+    return [*map(int, words)], lines
 
-    def _whole_lines(self) -> Iterator[tuple[bytes, float]]:
-        """Complete lines with their time of arrival, none where events were held back for long enough.
 
-        At the end of the input, also an incomplete last line.
-        """
-        rest, read_at = b"", 0.0
-        while True:
-            try:
-                arrived = self._queue.get(timeout=self._stream.patience_s() if self._stream else None)
-            except Empty:
-                yield b"", time.perf_counter()
-                continue
-            if arrived is None:
-                break
-            data, read_at = arrived
-            while len(data) < READ_BYTES and not self._queue.empty():  # data already waiting joins this piece
-                if (more := self._queue.get()) is None:
-                    self._queue.put(None)
-                    break
-                data += more[0]
-            lines, end, rest = (rest + data).rpartition(b"\n")
-            if end:
-                yield lines + end, read_at
-        if rest.strip():
-            yield rest + b"\n", read_at
+def _whole_lines(queue: Arrivals, patience_s: Callable[[], float | None]) -> Lines:
+    """Complete lines with their time of arrival, none where events were held back for long enough.
 
-    def _read(self, descriptor: int) -> None:
-        """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
+    At the end of the input, also an incomplete last line.
+    """
+    rest, read_at = b"", 0.0
+    while True:
         try:
-            while not self._source.closed and (data := os.read(descriptor, READ_BYTES)):  # the data available
-                self._queue.put((data, time.perf_counter()))
-        except OSError:  # the other end was closed
-            return
-        finally:
-            os.close(descriptor)
-            if self._source is not sys.stdin.buffer:
-                self._source.close()
-            self._queue.put(None)
+            arrived = queue.get(timeout=patience_s())
+        except Empty:
+            yield b"", time.perf_counter()
+            continue
+        if arrived is None:
+            break
+        data, read_at = arrived
+        while len(data) < READ_BYTES and not queue.empty():  # data already waiting joins this piece
+            if (more := queue.get()) is None:
+                queue.put(None)
+                break
+            data += more[0]
+        lines, end, rest = (rest + data).rpartition(b"\n")
+        if end:
+            yield lines + end, read_at
+    if rest.strip():
+        yield rest + b"\n", read_at
 
 
-class LiveCamera:
-    """Events of a camera in pieces, as they arrive; ends with the connection, or after `idle_s` without an event.
+def _read(source: BinaryIO, descriptor: int, queue: Arrivals) -> None:
+    """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
+    try:
+        while not source.closed and (data := os.read(descriptor, READ_BYTES)):  # the data available
+            queue.put((data, time.perf_counter()))
+    except OSError:  # the other end was closed
+        return
+    finally:
+        os.close(descriptor)
+        if source is not sys.stdin.buffer:
+            source.close()
+        queue.put(None)
 
-    Events with wrong times are left out and counted in `counts`. RuntimeError where dv-processing is missing;
-    RecordingError where the camera or program cannot be reached.
+
+def read_camera(address: str, mosaic: Mosaic, idle_s: float) -> Input:
+    """Read a camera as its events arrive; ends with the connection, or after `idle_s` without an event.
+
+    Events with wrong times are left out and counted. RuntimeError where dv-processing is missing; RecordingError where
+    the camera or program cannot be reached.
     """
+    reader = _opened(address)
+    width, height = reader.getEventResolution()
+    stream = _Stream(address, height, width, mosaic)
 
-    waits = False
-
-    def __init__(self, address: str, mosaic: Mosaic, idle_s: float):
-        self.name = address
-        self._idle_s = idle_s
-        self._reader = _opened(address)
-        width, height = self._reader.getEventResolution()
-        self._stream = _Stream(address, height, width, mosaic)
-        self.height, self.width, self.counts = self._stream.height, self._stream.width, self._stream.counts
-
-    def __iter__(self) -> Iterator[Piece]:
-        return pieces_of(self._blocks())
-
-    def _blocks(self) -> Iterator[tuple[list[Events], float]]:
-        nothing, quiet_since = np.empty((0, 4), np.int64), time.monotonic()
-        while time.monotonic() - quiet_since < self._idle_s:
-            batch = self._reader.getNextEventBatch()
+    def tables() -> Iterator[tuple[Table | None, float]]:
+        quiet_since = time.monotonic()
+        while time.monotonic() - quiet_since < idle_s:
+            batch = reader.getNextEventBatch()
             if batch is not None and not batch.isEmpty():
                 read_at, quiet_since = time.perf_counter(), time.monotonic()
                 columns = batch.timestamps(), batch.coordinates(), batch.polarities()
                 table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
-                yield from self._stream.add(table, read_at)
-            elif self._stream.patience_s() == 0:
-                yield from self._stream.add(nothing, 0.0, flush=True)
-            elif self._reader.isRunning():
+                yield table, read_at
+            elif stream.patience_s() == 0:
+                yield None, 0.0
+            elif reader.isRunning():
                 time.sleep(POLL_S)
             else:
                 break
-        yield from self._stream.add(nothing, 0.0, flush=True)
+
+    return stream.input(tables(), waits=False)
 
 
 def _opened(address: str) -> Any:
@@ -239,7 +226,7 @@ def _opened(address: str) -> Any:
 
 
 def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n"], bytes]:
-    """Four channels in the format of `LiveLines`: the first line, the sorted times, and the lines in that order."""
+    """Four channels in the format of `read_lines`: the first line, the sorted times, and the lines in that order."""
     tables = [
         np.stack([*(getattr(events, name).numpy().astype(np.int64) for name in "txyp"), np.full(len(events), angle)], 1)
         for events, angle in zip(channels, POLARIZER_ANGLES_DEG, strict=True)
@@ -251,7 +238,7 @@ def live_lines(channels: Sequence[Events]) -> tuple[bytes, Int64[np.ndarray, " n
 
 
 def replay(channels: Sequence[Events], speed: float, write: Callable[[bytes], object]) -> None:
-    """Write four channels in the format of `LiveLines`, at `speed` times the original pace."""
+    """Write four channels in the format of `read_lines`, at `speed` times the original pace."""
     head, times, lines = live_lines(channels)
     write(head)
     ends = [0, *itertools.accumulate(map(len, lines.splitlines(keepends=True)))]

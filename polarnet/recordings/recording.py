@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.recordings.formats import aedat2, aedat3, celex5, faery, hdf5, lines, prophesee, rosbag
+from polarnet.recordings.formats import aedat, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
 from polarnet.recordings.source import (
     GZIP,
@@ -72,8 +72,8 @@ FORMATS = {
         faery.aedat4_frames,
         parts=True,
     ),
-    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat3.MAGIC), aedat3.open_aedat3, parts=True),
-    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat2.MAGIC), aedat2.open_aedat2, aedat2.aedat2_frames),
+    "aedat3": Format("AEDAT 3.1 of iniVation", signature(aedat.MAGIC_3), aedat.open_aedat3, parts=True),
+    "aedat2": Format("AEDAT-2 of jAER, of a DAVIS", signature(aedat.MAGIC_2), aedat.open_aedat2, aedat.aedat2_frames),
     "event_stream": Format("Event Stream (.es)", signature(b"Event Stream"), partial(faery.open_faery, aedat4=False)),
     "evt": Format("EVT2, EVT2.1 and EVT3 of Prophesee", prophesee.matches_evt, prophesee.open_evt),
     "dat": Format("DAT of Prophesee", prophesee.matches_dat, prophesee.open_dat),
@@ -175,7 +175,7 @@ def read_recording(
     """
     reader = open_recording(path, format, height=height, width=width, part=part)
     (events,) = whole(([chunk] for chunk in reader), reader.height, reader.width, 1)
-    log_repairs(reader)
+    log_repairs(reader.path.name, reader.repairs)
     return Recording(events, reader.format, {kind: count for kind, count in reader.repairs.items() if count})
 
 
@@ -191,11 +191,18 @@ def whole(blocks: Iterable[Sequence[Events]], height: int, width: int, number: i
     return [Events(t, x, y, p, height, width) for t, x, y, p in (map(torch.from_numpy, columns) for columns in tables)]
 
 
-def log_repairs(reader: RecordingReader) -> None:
-    """Log a warning for each kind of damage that the latest iteration of a reader repaired."""
-    for kind, count in reader.repairs.items():
+def log_repairs(name: str, counts: Counts) -> None:
+    """Log a warning for each kind of damage of a file."""
+    for kind, count in counts.items():
         if count and kind not in HARMLESS:
-            logger.warning("%s: %d %s", reader.path.name, count, REPAIRS[kind])
+            logger.warning("%s: %d %s", name, count, REPAIRS[kind])
+
+
+def first_time_us(reader: RecordingReader) -> int:
+    """Time of the first event; RecordingError for a file without events."""
+    for events in reader:
+        return int(events.t[0])
+    raise RecordingError(f"{reader.path.name}: expected events, the file has none")
 
 
 def is_recording(path: Path) -> bool:

@@ -11,14 +11,12 @@ import torch
 
 from polarnet.events.rotation import Rotation, steady_rotation, triggered_rotation
 from polarnet.events.stream import Events
-from polarnet.recordings.arrangements import Channels, Open, open_four, open_mosaic, open_plain
+from polarnet.recordings.arrangements import FilePieces, Input, Open, open_four, open_mosaic, open_plain
 from polarnet.recordings.formats import hdf5
-from polarnet.recordings.live import SCHEME, LiveCamera, LiveLines
-from polarnet.recordings.noise import Cleaner
-from polarnet.recordings.recording import open_recording
+from polarnet.recordings.live import SCHEME, read_camera, read_lines
+from polarnet.recordings.recording import first_time_us, open_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import check_size, read_truth
-from polarnet.recovery.stream import Input
 from polarnet.stokes import Mosaic, StokesFrames, stokes_from_polarization
 from polarnet.storage.events import EventStore
 from polarnet.storage.parts import METADATA, unknown_sequence
@@ -33,7 +31,7 @@ def open_channels(
     mosaic: Mosaic | None = None,
     sequence: str | None = None,
     open_file: Open = open_recording,
-) -> Channels:
+) -> Input:
     """The four channels in files, starting at time 0; a ValueError says what is missing.
 
     Four files hold one channel each, behind polarizers at `angles`, in degrees and in the order of the files. A single
@@ -57,10 +55,10 @@ def open_channels(
     name = store.sequences[0] if sequence is None and len(store.sequences) == 1 else sequence
     if name not in store.sequences:
         raise ValueError(f"{path.name}: --sequence: {unknown_sequence(name, store.sequences)}")
-    return _stored(store, name)
+    return _stored(path.name, store, name)
 
 
-def _stored(store: EventStore, sequence: str) -> Channels:
+def _stored(name: str, store: EventStore, sequence: str) -> Input:
     """A sequence of a store, in blocks of about a million events."""
 
     def blocks() -> Iterator[Sequence[Events]]:
@@ -69,14 +67,7 @@ def _stored(store: EventStore, sequence: str) -> Channels:
         for start_us, stop_us in itertools.pairwise(edges):
             yield store.read(sequence, start_us, stop_us)
 
-    return Channels(store.height, store.width, blocks, origin_us=0)
-
-
-def input_of(name: str, channels: Channels, clean: Cleaner | None = None) -> Input:
-    """Channels as the input of a recovery, from which `clean` removes noise."""
-    repairs = {reader.path.name: reader.repairs for reader in channels.readers}
-    pieces = channels if clean is None else clean.clean(channels)
-    return Input(name, channels.height, channels.width, pieces, repairs, channels.number)
+    return Input(name, store.height, store.width, FilePieces(blocks, origin_us=0))
 
 
 def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Input, Rotation]:
@@ -84,11 +75,7 @@ def open_rotating(path: Path, rotation: Rotation, open_file: Open) -> tuple[Inpu
 
     `rotation` is by the file's clock, the returned one by that of the events. RecordingError for a file without events.
     """
-    channels = open_plain(path, open_file)
-    first = next(channels.blocks(), None)
-    if first is None:
-        raise RecordingError(f"{path.name}: expected events, the file has none")
-    return input_of(path.name, channels), rotation.since(int(first[0].t[0]))
+    return open_plain(path, open_file), rotation.since(first_time_us(open_file(path)))
 
 
 def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
@@ -98,32 +85,24 @@ def open_frames(path: Path, mosaic: Mosaic, open_file: Open) -> StokesFrames:
     """
     truth, reader = read_truth(path, mosaic), open_file(path)
     check_size(path, truth, reader.height, reader.width)
-    first = next(iter(reader), None)
-    if first is None:
-        raise RecordingError(f"{path.name}: expected events, the file has none")
     stokes = stokes_from_polarization(torch.ones_like(truth.dolp), truth.dolp, truth.aolp)[:, 1:]
-    return StokesFrames(truth.t_us, stokes, truth.valid).since(int(first.t[0]))
+    return StokesFrames(truth.t_us, stokes, truth.valid).since(first_time_us(reader))
 
 
-def open_live(path: str, mosaic: Mosaic | None, idle_s: float, clean: Cleaner) -> Input:
+def open_live(path: str, mosaic: Mosaic | None, idle_s: float) -> Input:
     """Read live from standard input (-), a file, or a camera (dv://...), which ends after `idle_s` without an event.
 
     ValueError for a camera without a mosaic.
     """
-    reader: LiveLines | LiveCamera
     if path.startswith(SCHEME):
         if mosaic is None:
             raise ValueError(f"{path}: expected --mosaic, the polarizers of the camera's pixels, with a camera")
-        reader = LiveCamera(path, mosaic, idle_s)
-    elif path == STANDARD_INPUT:
-        reader = LiveLines(sys.stdin.buffer, "standard input", mosaic)
-    elif Path(path).is_file():
-        reader = LiveLines(open(path, "rb"), Path(path).name, mosaic)  # noqa: SIM115 - read until the end
-    else:
+        return read_camera(path, mosaic, idle_s)
+    if path == STANDARD_INPUT:
+        return read_lines(sys.stdin.buffer, "standard input", mosaic)
+    if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: there is no such file; - reads standard input")
-    pieces = clean.clean(reader, live=True)
-    repairs = {reader.name: reader.counts}
-    return Input(reader.name, reader.height, reader.width, pieces, repairs, live=True, waits=reader.waits)
+    return read_lines(open(path, "rb"), Path(path).name, mosaic)
 
 
 def rotation_of(rate_hz: float | None, triggers: Path | None, start_angle_deg: float) -> Rotation:

@@ -27,7 +27,7 @@ from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_
 from polarnet.methods.overlap import advance, begin, equal_parts, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.arrangements import Piece
+from polarnet.recordings.arrangements import Input, Piece
 from polarnet.recovery.ahead import Ahead
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import tune
@@ -51,28 +51,6 @@ SCORES = {
     "aolp_deg": "AoLP error {:.1f} degrees",
     "oracle_mse": "MSE of the true mean of each frame alone {:.4f}",
 }
-
-
-class Input(NamedTuple):
-    """Events of channels of equal size, piece by piece."""
-
-    name: str
-    height: int
-    width: int
-    pieces: Iterable[Piece]
-    repairs: Mapping[str, Mapping[str, int]] = {}
-    """Unusable events by file and kind (`polarnet.recordings.source.REPAIRS`), counted while `pieces` are read."""
-    channels: int = 4
-    """4, or 1 for a camera behind a rotating polarizer."""
-    live: bool = False
-    """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
-    waits: bool = True
-    """Whether the source waits until it is read. Windows of a live one that does not are joined if need be."""
-
-    def shares_read(self) -> dict[str, str]:
-        """The part of the files that is read, in words; empty where their formats do not tell."""
-        shares = [getattr(counts, "share_read", 0.0) for counts in self.repairs.values()]
-        return {"read": f"{sum(shares) / len(shares):.0%}"} if any(shares) else {}
 
 
 class Frame(NamedTuple):

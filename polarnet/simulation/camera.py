@@ -21,9 +21,8 @@ from polarnet.events.stream import Events, select
 from polarnet.runtime.compilation import compiled, forget_stale_code
 from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section
-from polarnet.simulation.emulator import EmulatorConfig
+from polarnet.simulation.emulator import EmulatorConfig, draws
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.ranges import draws
 from polarnet.stokes import NUM_CHANNELS, POLARIZER_ANGLES_DEG, analyzer, parse_mosaic
 
 Value = TypeVar("Value")
@@ -111,11 +110,6 @@ class Camera:
             "polarizers": asdict(self.polarizers),
             "readout": asdict(self.readout),
         }
-
-    def draws(self, seed: int, sequence: str) -> dict[str, dict[str, Any]]:
-        """Values that a sequence draws from the ranges of `randomise`, by section and parameter."""
-        drawn = draws(self.sensor, seed, sequence)
-        return {"emulate": drawn} if drawn else {}
 
     def drawn(self, seed: int, sequence: str, purpose: str = "emulate") -> "Camera":
         """The camera of one sequence: with a key, and the sequence's own values for the ranges of `randomise`."""

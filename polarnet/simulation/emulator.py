@@ -1,8 +1,9 @@
 """Event-camera emulation: light on the channels of one sensor in, events and the sensor's state out."""
 
+import math
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Protocol
 
@@ -15,13 +16,12 @@ from torch import Tensor
 from polarnet.events.stream import Events, concatenate
 from polarnet.runtime.arrays import Array, as_tensor, check_finite, check_range, check_shape
 from polarnet.runtime.compilation import forget_stale_code
+from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, empty_columns
-from polarnet.simulation.pixels.defects import Defects, defects_of
+from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, Defects, defects_of, empty_columns
 from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.pixels.physics import MAX_RATE_HZ
-from polarnet.simulation.ranges import check_ranges
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ, PixelConfig
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
@@ -62,11 +62,15 @@ class PixelModel(Protocol):
 
 OFF = {"dark_dn": None, "photoreceptor_noise": 0.0, "refractory": "keep"}
 """Values that switch off the parameters that only some models have; others refuse any other value."""
+LOGARITHMIC = "_hz"
+"""Name suffix of the parameters whose logarithm is drawn uniformly: rates and bandwidths."""
+NAMES = ("model", "refractory")
+"""Parameters that are one of several names, each listed name as likely as the others."""
 MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_voltmeter": voltmeter}
 
 
 @section
-class EmulatorConfig(esim.EsimConfig):
+class EmulatorConfig(PixelConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
     A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
@@ -86,20 +90,67 @@ class EmulatorConfig(esim.EsimConfig):
     hot_pixel_rate_hz: Annotated[float, Field(ge=0, le=MAX_RATE_HZ)]
     """Events per second of a hot pixel, ON and OFF together; 0: it is dead."""
     randomise: dict[str, list[float | str]] | None
-    """Draws of each sequence: [lowest, highest] of a number, or the names that a parameter of `ranges.NAMES` may take.
+    """Draws of each sequence: [lowest, highest] of a number, or the names that a parameter of `NAMES` may take.
 
     A name that is listed twice is drawn twice as often. null: nothing is drawn.
     """
 
     def __post_init__(self):
         super().__post_init__()
-        check_ranges(self)
+        _check_ranges(self)
         for name, off in OFF.items():
             value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
             if value != off and self.model not in having:
                 raise ValueError(
                     f"{name}: expected {off} with model {self.model}, got {value}; models with it: {', '.join(having)}"
                 )
+
+
+def _check_ranges(config: EmulatorConfig) -> None:
+    """ValueError for ranges that are not ranges, or beyond those of their parameter."""
+    drawable = [name for name, value in vars(config).items() if name in NAMES or not isinstance(value, str)]
+    drawable.remove("randomise")
+    ranges: dict[str, Any] = config.randomise or {}
+    for name, values in ranges.items():
+        if name not in drawable:
+            raise ValueError(f"randomise.{name}: expected one of {', '.join(drawable)}, got {name!r}")
+        if name in NAMES and not values:
+            raise ValueError(f"randomise.{name}: expected at least one name, got {values}")
+        if name not in NAMES:
+            _check_bounds(name, values)
+        for value in values:
+            try:
+                replace(config, randomise=None, **{name: value})
+            except ValueError as error:
+                raise ValueError(f"randomise.{error}") from None
+
+
+def _check_bounds(name: str, values: Sequence[float | str]) -> None:
+    numbers = [value for value in values if isinstance(value, float)]
+    if len(values) != 2 or numbers != values or numbers[0] > numbers[1]:
+        raise ValueError(f"randomise.{name}: expected [lowest, highest], got {values}")
+    if name.endswith(LOGARITHMIC) and numbers[0] <= 0:
+        raise ValueError(f"randomise.{name}: expected a lowest value > 0, got {values}; the logarithm is drawn")
+
+
+def draws(config: EmulatorConfig, seed: int, sequence: str) -> dict[str, Any]:
+    """Values that a sequence draws from `randomise`, by parameter.
+
+    A draw depends only on seed, sequence, parameter and range, so that other ranges do not change it.
+    """
+    values: dict[str, Any] = {}
+    ranges: dict[str, Any] = config.randomise or {}
+    for name, listed in ranges.items():
+        generator = generator_for(seed, sequence, name)
+        if name in NAMES:
+            values[name] = listed[int(generator.integers(len(listed)))]
+            continue
+        lowest, highest = listed
+        if name.endswith(LOGARITHMIC):
+            values[name] = math.exp(generator.uniform(math.log(lowest), math.log(highest)))
+        else:
+            values[name] = generator.uniform(lowest, highest)
+    return values
 
 
 @dataclass(frozen=True)

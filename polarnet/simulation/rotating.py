@@ -1,9 +1,6 @@
 """Events of one sensor behind a polarizer that rotates in front of it: one channel with weights in time."""
 
-import functools
 import math
-from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -13,15 +10,12 @@ from pydantic import Field
 from polarnet.events.rotation import Rotation, steady_rotation
 from polarnet.events.stream import Events
 from polarnet.runtime.sections import section
-from polarnet.simulation.camera import Camera, Grid, grid, read_out
+from polarnet.simulation.camera import Camera, Grid, read_out
 from polarnet.simulation.emulator import Channels, emulate_frames
-from polarnet.simulation.event_sets import Emulated, Mapper, fill_store, motion_over, origin_of
 from polarnet.simulation.motion import Trajectory
 from polarnet.simulation.moving_sensor import behind_polarizers, checked_pose, render_times_us, rendered_chunks
 from polarnet.simulation.scene import PolarizationScene
-from polarnet.stokes import NUM_CHANNELS, analyzer
-from polarnet.storage.events import EventStore
-from polarnet.storage.scenes import SceneStore
+from polarnet.stokes import analyzer
 
 
 @section
@@ -70,27 +64,3 @@ def emulate_rotating(
     frames = ((times, behind_polarizers(stokes, rotating.weights(times))) for times, stokes in rendered)
     (events,), _ = emulate_frames(Channels(*size, sensor, camera.key), frames)
     return read_out(events, camera.readout, duration_us)
-
-
-def emulate_rotating_scenes(
-    scenes: Path, events: Path, rotating: RotatingConfig, camera: Camera, seed: int, mapper: Mapper
-) -> int:
-    """Emulate the test sequences of a scene store behind the rotating polarizer, and return their number.
-
-    Events are in the store's first channel; the other three are empty. `mapper` is as in `event_sets.emulate_scenes`.
-    """
-    source = SceneStore.open(scenes)
-    pixels = grid(source.attributes["layout"], source.sensor_height, source.sensor_width)
-    attributes = {**origin_of(source, camera, seed), "rotating": asdict(rotating)}
-    size, per_part = (pixels.height, pixels.width), source.sequences_per_part
-    store = EventStore.create(events, source.of_split("test"), *size, attributes, per_part)
-    return fill_store(store, functools.partial(_emulated, source, rotating, camera, seed, pixels), mapper)
-
-
-def _emulated(
-    scenes: SceneStore, rotating: RotatingConfig, camera: Camera, seed: int, pixels: Grid, sequence: str
-) -> Emulated:
-    over_scene = motion_over(scenes, sequence)
-    output = emulate_rotating(rotating, camera.drawn(seed, sequence, "rotating"), *over_scene, pixels)
-    channels = [output, *[Events.empty(pixels.height, pixels.width)] * (NUM_CHANNELS - 1)]
-    return channels, over_scene[-1], camera.draws(seed, sequence), None

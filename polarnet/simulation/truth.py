@@ -185,25 +185,21 @@ def _synthesize_part(scenes: SceneStore, frames: FrameStore, synthesis: Synthesi
 def _planes_of(scene: str, picture: str, synthesis: Synthesis) -> tuple[Polarization, float | None]:
     """Scene made from a picture, quantised as stored, and the dynamic range to which `stretched` stretches it.
 
-    Events and truth are rendered from the same values.
+    Events and truth are rendered from the same values. The mask of known pixels is None where all are known.
     """
-    polarization, valid = _read_polarization(synthesis.images, picture)
+    dynamic_range, valid = synthesis.motion.dynamic_range, None
+    measured, light, rgb = (synthesis.images / f"{picture}{suffix}" for suffix in (".npz", LIGHT, ".png"))
+    if light.exists():
+        polarization = scene_module.polarization_from_light(np.load(light).transpose(2, 0, 1))
+    elif measured.exists():
+        intensities, valid = read_intensities(measured)
+        s = scene_module.scene_from_intensities(intensities).stokes
+        polarization = torch.stack([s[0].clamp(max=1), stokes.dolp(s).clamp(max=1), stokes.aolp(s)])
+    else:
+        polarization = scene_module.polarization_from_rgb(read_rgb(rgb))
     if synthesis.variation and scene != picture:
         polarization = varied(polarization, synthesis.variation, generator_for(synthesis.seed, scene, "variation"))
     s0, dolp, aolp = polarization
-    dynamic_range = synthesis.motion.dynamic_range
-    if (synthesis.images / f"{picture}{LIGHT}").exists():
+    if light.exists():
         s0, dynamic_range = logarithmic(s0, LIGHT_RANGE), LIGHT_RANGE
     return as_stored(Polarization(s0, dolp, aolp, valid)), dynamic_range
-
-
-def _read_polarization(images: Path, picture: str) -> tuple[Float[Tensor, "3 h w"], Bool[Tensor, "h w"] | None]:
-    """(S0, DoLP, AoLP) of a photograph or measurement, and the mask of known pixels (None: all are known)."""
-    measured, light = images / f"{picture}.npz", images / f"{picture}{LIGHT}"
-    if light.exists():
-        return scene_module.polarization_from_light(np.load(light).transpose(2, 0, 1)), None
-    if not measured.exists():
-        return scene_module.polarization_from_rgb(read_rgb(images / f"{picture}.png")), None
-    intensities, valid = read_intensities(measured)
-    s = scene_module.scene_from_intensities(intensities).stokes
-    return torch.stack([s[0].clamp(max=1), stokes.dolp(s).clamp(max=1), stokes.aolp(s)]), valid

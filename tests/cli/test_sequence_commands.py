@@ -4,9 +4,10 @@ import av
 import pytest
 
 from polarnet.cli import main
+from polarnet.storage.frames import FrameStore
 
 
-def test_inspect_names_sequences_and_video_shows_each_true_frame_after_the_first(simulated, capsys, tmp_path):
+def test_inspect_names_the_sequences_of_a_store(simulated, capsys):
     assert main(["inspect", str(simulated.events)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["a-0", "b-0", "c-0", "d-0"]
@@ -18,15 +19,9 @@ def test_inspect_names_sequences_and_video_shows_each_true_frame_after_the_first
 def test_video_shows_a_picture_for_each_true_frame_after_the_first(simulated, tmp_path, capsys):
     assert main(["video", str(simulated.events), "b-0", "--out", str(tmp_path / "b.mp4")]) == 0
     with av.open(str(tmp_path / "b.mp4")) as file:
-        assert len([*file.decode(video=0)]) == len(zarr_times(simulated)) - 1
+        assert len([*file.decode(video=0)]) == len(FrameStore.open(simulated.frames).t_us("b-0")) - 1
     assert main(["video", str(simulated.events), "e-0"]) == 1
     assert "expected a sequence of a-0, b-0, c-0, d-0; got 'e-0'" in capsys.readouterr().err
-
-
-def zarr_times(simulated):
-    from polarnet.storage.frames import FrameStore
-
-    return FrameStore.open(simulated.frames).t_us("b-0")
 
 
 def test_one_sequence_of_a_store_is_converted(simulated, tmp_path):

@@ -7,7 +7,7 @@ from textwrap import shorten
 
 import pytest
 
-from polarnet.recordings.live import LiveLines
+from polarnet.recordings.live import read_lines
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
 
@@ -115,9 +115,9 @@ def test_a_case_has_the_events_that_it_was_written_with(cases, read, name, recor
 @pytest.mark.parametrize("name", LIVE)
 def test_a_case_goes_on_live(cases, name, record_property):
     with (cases / name).open("rb") as file:
-        live = LiveLines(file, name, ((90, 45), (135, 0)))
-        events = sum(len(channel) for piece in live for channel in piece.channels)
-    repairs = {kind: count for kind, count in live.counts.items() if count}
+        live = read_lines(file, name, ((90, 45), (135, 0)))
+        events = sum(len(channel) for piece in live.pieces for channel in piece.channels)
+    repairs = {kind: count for kind, count in live.repairs[0][1].items() if count}
     record_property("now", f"live {events} events{mended(repairs)}")
     assert (events, repairs) == LIVE[name]
 

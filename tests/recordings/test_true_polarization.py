@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.recordings.formats.aedat2 import aedat2_frames
+from polarnet.recordings.formats.aedat import aedat2_frames
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.truth import read_truth
 from polarnet.stokes import aolp, dolp, parse_mosaic, stokes_from_intensities

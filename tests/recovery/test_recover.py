@@ -18,7 +18,7 @@ from polarnet.methods.dolp_network import dolp_recoverer
 from polarnet.networks import load_network, shipped_weights
 from polarnet.recordings.formats.lines import lines_of
 from polarnet.recordings.live import live_lines, replay
-from polarnet.recovery.inputs import input_of, open_channels
+from polarnet.recovery.inputs import open_channels
 from polarnet.recovery.stream import frames_of, open_method
 from polarnet.runtime import machine as runtime
 from polarnet.storage.events import EventStore
@@ -38,7 +38,7 @@ def write_lines(path, events):
 
 
 def opened(store):
-    return input_of("lake", open_channels([store], sequence="lake"))
+    return open_channels([store], sequence="lake")
 
 
 def recovered(out):

@@ -4,7 +4,7 @@ import cv2
 import torch
 
 from polarnet.events.stream import Events
-from polarnet.reports.comparison import comparison_figure, score_line
+from polarnet.reports.figures import comparison_figure, score_line
 from polarnet.reports.maps import png
 from polarnet.reports.recordings import draw_sequence
 from polarnet.storage.frames import Frames

@@ -3,15 +3,15 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
-from event_fixtures import equal
 from simulation_fixtures import QUIET, REST, STILL
 
 from polarnet.config.tree import load
-from polarnet.simulation import SENSORS, emulate, scene_from_polarization
+from polarnet.simulation import SENSORS, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
-from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
-from polarnet.simulation.rotating import RotatingConfig, emulate_rotating, emulate_rotating_scenes
+from polarnet.simulation.moving_sensor import render_times_us
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
+from polarnet.simulation.sets import emulate_scenes
 from polarnet.storage import EventStore, SceneStore
 from polarnet.storage.frames import Contents, Polarization
 
@@ -33,16 +33,6 @@ def test_unpolarized_light_fires_nothing_and_dolp_one_half_three_events_down_and
     rotating = replace(ROTATING, start_angle_deg=45.0)
     events = still_events(QUIET, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
     assert events.p.tolist() == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5
-
-
-def test_v2e_sees_eight_bits_of_the_light():
-    sensor, scene = replace(SENSORS["clean"], model="v2e"), uniform_scene(0.1, 0.5)
-    t_us = render_times_us(resting_trajectory(4, 6), 200_000, 4, 6, sensor, 1440.0)
-    light = behind_polarizers(scene.stokes.numpy()[:, None].repeat(len(t_us), axis=1), ROTATING.weights(t_us))
-    (expected,), _ = emulate((light[0, :, None] + 0.5).astype(np.uint8), t_us, sensor, key=1)
-    events = still_events(sensor, scene, 200_000)
-    assert len(events) > 100
-    assert equal(events, expected)
 
 
 def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need():
@@ -77,8 +67,8 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     for name in names:
         store.write(name, Polarization(maps[0], maps[1], 3 * maps[2]), asdict(trajectory), 100_000)
     store.finish()
-    arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.rotating, config.camera, config.seed, map
-    assert emulate_rotating_scenes(*arguments) == 1
+    arguments = tmp_path / "scenes.zarr", tmp_path / "events.zarr", config.camera, config.seed, map, 1
+    assert emulate_scenes(*arguments, config.rotating) == 1
     events = EventStore.open(tmp_path / "events.zarr")
     assert events.sequences == ["wood-00"]
     first, *others = events.read("wood-00")
@@ -86,8 +76,7 @@ def test_only_test_sequences_are_stored_and_a_second_run_makes_the_same(project_
     assert len(first) > 0
     assert [len(channel) for channel in others] == [0, 0, 0]
     written = (tmp_path / "events.zarr" / "zarr.json").read_bytes()
-    assert emulate_rotating_scenes(*arguments) == 1
+    assert emulate_scenes(*arguments, config.rotating) == 1
     assert (tmp_path / "events.zarr" / "zarr.json").read_bytes() == written
-    faster = replace(config.rotating, rate_hz=30.0)
-    emulate_rotating_scenes(*arguments[:2], faster, *arguments[3:])
+    emulate_scenes(*arguments, replace(config.rotating, rate_hz=30.0))
     assert len(EventStore.open(tmp_path / "events.zarr").read("wood-00")[0]) > len(first)

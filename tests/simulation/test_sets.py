@@ -37,22 +37,18 @@ def plain(label):
     return map
 
 
-def test_every_picture_of_a_folder_is_for_testing(photographs, tmp_path, recipe):
-    assert make_folder_set(photographs, "auto", tmp_path / "set", recipe, plain)
-    frames, events = (
-        FrameStore.open(tmp_path / "set" / "frames.zarr"),
-        EventStore.open(tmp_path / "set" / "events.zarr"),
-    )
-    assert len(frames.of_split("test")) == 2
-    assert frames.of_split("test") == events.sequences
-    assert all(sum(events.count(name)) > 100 for name in events.sequences)
-
-
-def test_a_set_is_made_once_and_again_only_when_its_recipe_or_its_pictures_change(photographs, tmp_path, recipe):
+def test_a_set_has_every_picture_for_testing_and_is_made_again_only_when_its_recipe_or_pictures_change(
+    photographs, tmp_path, recipe
+):
     def make(recipe: Recipe) -> bool:
         return make_folder_set(photographs, "auto", tmp_path / "set", recipe, plain)
 
     assert make(recipe)
+    folder = tmp_path / "set"
+    frames, events = FrameStore.open(folder / "frames.zarr"), EventStore.open(folder / "events.zarr")
+    assert len(frames.of_split("test")) == 2
+    assert frames.of_split("test") == events.sequences
+    assert all(sum(events.count(name)) > 100 for name in events.sequences)
     assert not make(recipe)
     turning = replace(recipe, motion=replace(recipe.motion, rotation_max_deg=10.0))
     assert make(turning)

@@ -21,10 +21,10 @@ from polarnet.pictures.manifest import read_manifest, write_manifest
 from polarnet.runtime.cluster import pmap
 from polarnet.simulation import MOTIONS, SENSORS, Camera, PolarizationScene, scene_from_polarization, scene_from_rgb
 from polarnet.simulation.camera import IDEAL, Grid, weights_of
-from polarnet.simulation.event_sets import emulate_scenes, motion_over
 from polarnet.simulation.motion import SynthesizeConfig, Trajectory, frame_times_us, random_trajectory, render
 from polarnet.simulation.moving_sensor import channel_light
 from polarnet.simulation.scene import LIGHT_RANGE, logarithmic, scene_from_light, stretched
+from polarnet.simulation.sets import emulate_scenes, motion_over
 from polarnet.simulation.truth import Synthesis, frames_of, synthesize, valid_frames
 from polarnet.stokes import aolp, dolp, stokes_from_intensities
 from polarnet.storage import EventStore, FrameStore, SceneStore

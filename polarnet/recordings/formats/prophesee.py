@@ -8,10 +8,12 @@ exchanged. As in Prophesee's OpenEB, the header states the order, and where it d
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
 from polarnet.recordings.source import (
     BLOCK_EVENTS,
@@ -41,6 +43,14 @@ FIRST_LITTLE_ENDIAN = 55  # system ID of the EVK2 that came after those with exc
 DAT_EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 CHANGE_DETECTION = (0, 12)  # DAT's types of events: 2D of the first sensors, CD of the later ones
 
+LOW, HIGH, HIGH_AND_LOW, ROW, BASE, PIXEL, NOTHING = range(-7, 0)
+"""Kinds of 16-bit words: bits of the time (HIGH_AND_LOW: the low ones are 0 after a change), the next events' y, x of
+the next mask, x of an event. Positive kinds are masks of that many pixels."""
+EVT3_KINDS = np.array([ROW, NOTHING, PIXEL, BASE, 12, 8, LOW, NOTHING, HIGH_AND_LOW, *[NOTHING] * 7])
+LIBCAER_KINDS = np.array([HIGH, LOW, ROW, PIXEL, BASE, 8, *[NOTHING] * 10])  # with x and y exchanged
+EVT_START = -1, 0, 0, -1, 0, 0
+"""High bits of the time, their wraps, low bits, y, base x, its polarity; negative ones are not known."""
+
 
 def matches_evt(path: Path, head: bytes) -> bool:
     """Whether the header names an EVT format."""
@@ -63,30 +73,25 @@ def open_evt(path: Path, choices: Choices) -> Source:
     legacy = version == "2.1" and _is_legacy(header)
 
     def blocks(counts: Counts) -> Iterator[Block]:
-        decode = evt_decoder(version, legacy)
+        state = np.array(EVT_START)
         for words in word_blocks(path, len(header), EVT[version][0], EVT_BLOCK_WORDS, counts):
-            yield decode(words, counts)
+            if legacy:  # the two halves are exchanged
+                words = words << np.uint64(32) | words >> np.uint64(32)
+            yield evt_block(version, words, state, counts)
 
     return Source(height, width, blocks)
 
 
-def evt_decoder(version: str, legacy: bool = False) -> Callable[[np.ndarray, Counts], Block]:
-    """A decoder of consecutive words of an EVT version; it counts events before the first time or row as `orphans`.
+def evt_block(version: str, words: np.ndarray, state: Int64[np.ndarray, " 6"], counts: Counts) -> Block:
+    """Events of the next words of a key of `EVT`; `state`, first `EVT_START`, is updated.
 
-    `legacy`: the two halves of the words of EVT2.1 are exchanged.
+    Events before the first time or row are counted as `orphans`.
     """
     _, per_word, decode_words = EVT[version]
-    state = np.array([-1, 0, 0, -1, 0, 0])  # high bits of the time, their wraps, low bits, y, base x, its polarity
-
-    def decode(words: np.ndarray, counts: Counts) -> Block:
-        if legacy:
-            words = words << np.uint64(32) | words >> np.uint64(32)
-        columns = [np.empty(per_word * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
-        events, orphans = decode_words(words, state, *columns)
-        counts["orphans"] += int(orphans)
-        return Block(*(column[:events] for column in columns))
-
-    return decode
+    columns = [np.empty(per_word * len(words), t) for t in (np.int64, np.int16, np.int16, np.int8)]
+    events, orphans = decode_words(words, state, *columns)
+    counts["orphans"] += int(orphans)
+    return Block(*(column[:events] for column in columns))
 
 
 def open_dat(path: Path, choices: Choices) -> Source:
@@ -174,41 +179,45 @@ def _decode_evt21(words, state, t, x, y, p):
 
 
 @compiled
-def _decode_evt3(words, state, t, x, y, p):
-    """Decode words by their upper 4 bits: 0 y, 2 x, 3 base x, 4 and 5 masks of 12 and 8 pixels from it, 6, 8 time."""
+def _decode_vectors(kinds, words, state, t, x, y, p):
+    """Decode words of 16 bits by the kinds of their upper 4 bits; masks are of neighbours in x."""
     high, turns, low, row, base, polarity = state
     n, orphans = 0, 0
     for i in range(len(words)):
         word = np.int64(words[i])
-        kind, value = word >> 12, word & 0xFFF
-        if kind == 6:
+        kind, value = kinds[np.uint64(word >> 12)], word & 0xFFF  # unsigned: no check for a place from the end
+        if kind == LOW:
             low = value
-        elif kind == 8:
+        elif kind in (HIGH, HIGH_AND_LOW):
             before, high = high, value
             turns += before - high > 2**11
-            low = 0 if before != high else low
-        elif kind == 0:
+            low = 0 if kind == HIGH_AND_LOW and before != high else low
+        elif kind == ROW:
             row = value & 0x7FF
-        elif kind == 3:
+        elif kind == BASE:
             base, polarity = value & 0x7FF, value >> 11
-        elif kind == 2 or kind == 4 or kind == 5:
+        elif kind != NOTHING:
             if high < 0 or row < 0:
                 orphans += 1
                 continue
             now = (turns << 12 | high) << 12 | low
-            if kind == 2:
+            if kind == PIXEL:
                 t[n], x[n], y[n], p[n] = now, value & 0x7FF, row, value >> 11
                 n += 1
                 continue
-            pixels = 12 if kind == 4 else 8
-            for k in range(pixels):
+            for k in range(kind):
                 if value >> k & 1:
                     t[n], x[n], y[n], p[n] = now, base + k, row, polarity
                     n += 1
-            base = min(base + pixels, 2048)  # outside every sensor; larger values would not fit into int16
+            base = min(base + kind, 2048)  # outside every sensor; larger values would not fit into int16
     state[:] = high, turns, low, row, base, polarity
     return n, orphans
 
 
-EVT = {"2": ("<u4", 1, _decode_evt2), "2.1": ("<u8", 32, _decode_evt21), "3": ("<u2", 12, _decode_evt3)}
-"""Word, most events in a word, and decoder of each version."""
+EVT = {
+    "2": ("<u4", 1, _decode_evt2),
+    "2.1": ("<u8", 32, _decode_evt21),
+    "3": ("<u2", 12, partial(_decode_vectors, EVT3_KINDS)),
+    "libcaer_cmp": ("<u2", 8, partial(_decode_vectors, LIBCAER_KINDS)),
+}
+"""Word, most events in a word, and decoder of each version of EVT, and of libcaer's packets of the same kind."""

@@ -8,13 +8,14 @@ Metavision and libcaer write them.
 import contextlib
 import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
-from polarnet.recordings.formats.prophesee import evt_decoder
+from polarnet.recordings.formats.prophesee import EVT_START, evt_block
 from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part
 from polarnet.terminal.installation import installation
 
@@ -133,78 +134,48 @@ def _microseconds(events: np.ndarray) -> np.ndarray:
 
 def _packet_blocks(path: Path, packets: Iterator[Any], counts: Counts) -> Iterator[Block]:
     """Events of consecutive packets of one encoding."""
-    encoding, decode = "", None
+    encoding, state = "", np.array(EVT_START)
     for packet in packets:
-        if decode is None and packet.encoding in PACKETS:
-            encoding, decode = packet.encoding, PACKETS[packet.encoding]()
-        if decode is None or packet.encoding != encoding:
+        encoding = encoding or packet.encoding
+        if encoding not in PACKETS or packet.encoding != encoding:
             raise RecordingError(
                 f"{path.name}: expected packets of one encoding of {', '.join(PACKETS)}, got {packet.encoding!r}"
             )
-        yield decode(packet, counts)
+        word, decode = PACKETS[encoding]
+        content, kind = np.asarray(packet.events), np.dtype(f"{'>' if packet.is_bigendian else '<'}{word}")
+        words = content[: len(content) // kind.itemsize * kind.itemsize].view(kind)
+        yield decode(words.astype(word, copy=False), packet.time_base, state, counts)
 
 
-def _evt(version: str, word: str) -> Callable[[], Callable[[Any, Counts], Block]]:
-    """A maker of decoders of Prophesee's words, whose time runs on from packet to packet."""
-
-    def make() -> Callable[[Any, Counts], Block]:
-        decode = evt_decoder(version)
-        return lambda packet, counts: decode(_words(packet, word), counts)
-
-    return make
+def _evt(version: str, words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
+    """Prophesee's words, whose time runs on from packet to packet."""
+    return evt_block(version, words, state, counts)
 
 
-def _mono(packet: Any, counts: Counts) -> Block:
+def _mono(words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
     """Words of 64 bits: nanoseconds since the packet's time base, x, y, polarity."""
-    words = _words(packet, "u8")
-    t = (packet.time_base + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)) // 1000
+    t = (base + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)) // 1000
     return Block(t, words >> 32 & 0xFFFF, words >> 48 & 0x7FFF, words >> 63)
 
 
-def _libcaer(packet: Any, counts: Counts) -> Block:
+def _libcaer(words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
     """Polarity events of libcaer: y and x in the bits of 32, then 31 bits of microseconds since the time base in ns."""
-    data, low = _words(packet, "u4").reshape(-1, 2).T
+    data, low = words.reshape(-1, 2).T
     wraps = np.cumsum(np.diff(low.astype(np.int64), prepend=low[:1]) < 0)
-    return Block(packet.time_base // 1000 + low + (wraps << 31), data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1)
+    return Block(base // 1000 + low + (wraps << 31), data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1)
 
 
-def _libcaer_compressed(packet: Any, counts: Counts) -> Block:
-    """Words of 16 bits by their upper 4: 0 and 1 microseconds since the base, 2 x, 3 y, 4 base y, 5 a mask of rows."""
-    words = _words(packet, "u2").astype(np.int64)
-    kind, value, place = words >> 12, words & 0xFFF, np.arange(len(words))
-
-    def latest(code: int) -> np.ndarray:
-        """The place of the latest word of a kind; -1 before the first."""
-        return np.maximum.accumulate(np.where(kind == code, place, -1))
-
-    def valued(code: int) -> np.ndarray:
-        return np.where(latest(code) < 0, 0, value[latest(code)])
-
-    t, x, base = packet.time_base + (valued(0) << 12 | valued(1)), valued(2) & 0x7FF, valued(4)
-    masks = np.cumsum(kind == 5)
-    row = (base & 0x7FF) + 8 * (masks - 1 - np.where(latest(4) < 0, 0, masks[latest(4)]))
-    at, bit = np.nonzero((kind == 5)[:, None] & (value[:, None] >> np.arange(8) & 1 == 1))
-    one = np.flatnonzero(kind == 3)
-    order = np.argsort(np.concatenate([one, at]), kind="stable")
-    where = np.concatenate([one, at])[order]
-    y, p = (
-        np.concatenate([value[one] & 0x7FF, row[at] + bit])[order],
-        np.concatenate([value[one] >> 11, base[at] >> 11]),
-    )
-    return Block(t[where], x[where], y, p[order])
+def _libcaer_compressed(words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
+    """Compressed events of libcaer, in microseconds since the packet's time base."""
+    t, y, x, p = evt_block("libcaer_cmp", words, np.zeros_like(state), counts)
+    return Block(base + t, x, y, p)
 
 
-def _words(packet: Any, kind: str) -> np.ndarray:
-    content = np.asarray(packet.events)
-    size = np.dtype(kind).itemsize
-    return content[: len(content) // size * size].view(f"{'>' if packet.is_bigendian else '<'}{kind}")
-
-
-PACKETS: dict[str, Callable[[], Callable[[Any, Counts], Block]]] = {
-    "evt3": _evt("3", "u2"),
-    "evt2": _evt("2", "u4"),
-    "mono": lambda: _mono,
-    "libcaer": lambda: _libcaer,
-    "libcaer_cmp": lambda: _libcaer_compressed,
+PACKETS: dict[str, tuple[str, Callable[[np.ndarray, int, np.ndarray, Counts], Block]]] = {
+    "evt3": ("u2", partial(_evt, "3")),
+    "evt2": ("u4", partial(_evt, "2")),
+    "mono": ("u8", _mono),
+    "libcaer": ("u4", _libcaer),
+    "libcaer_cmp": ("u2", _libcaer_compressed),
 }
-"""Makers of decoders of event_camera_msgs' encodings; a decoder takes consecutive packets."""
+"""Word and decoder of event_camera_msgs' encodings; a decoder takes words, time base and state of a packet."""

@@ -8,10 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import PositiveFloat
 
 from polarnet.runtime.compilation import ZERO, compiled
-from polarnet.runtime.sections import section
 from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
 from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
 from polarnet.simulation.pixels.physics import PixelConfig
@@ -22,16 +20,8 @@ NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
 NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test
 
 
-@section
-class EsimConfig(PixelConfig):
-    """Parameters of ESIM's pixel; ESIM uses only thresholds and refractory period of the inherited ones."""
-
-    esim_log_eps: PositiveFloat
-    """Constant added to the intensity in [0, 1] before the logarithm."""
-
-
 class Physics(NamedTuple):
-    """`EsimConfig` for compiled kernels."""
+    """`PixelConfig` for compiled kernels."""
 
     threshold_on: float
     threshold_off: float
@@ -47,7 +37,7 @@ class Pixels(NamedTuple):
     last_event_us: np.ndarray  # float64
 
 
-def physics_of(config: EsimConfig) -> Physics:
+def physics_of(config: PixelConfig) -> Physics:
     """The parameters for the kernels."""
     on, off = config.contrast_threshold_on, config.contrast_threshold_off
     return Physics(on, off, config.refractory_period_us, config.esim_log_eps)

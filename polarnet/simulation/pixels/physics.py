@@ -7,7 +7,7 @@ import math
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from polarnet.runtime.compilation import borrowing, inlined
 from polarnet.runtime.sections import one_of, section
@@ -27,7 +27,7 @@ DARK_SHOT_NOISE = 1 - SHOT_NOISE_SLOPE * DARK_OFFSET / SATURATION  # fraction of
 
 @section
 class PixelConfig:
-    """Parameters of v2e's pixel. Contrast thresholds are steps of natural-log intensity."""
+    """Parameters of the pixel models, v2e's first. Contrast thresholds are steps of natural-log intensity."""
 
     knee_dn: Annotated[float, Field(ge=MIN_KNEE_DN, le=FULL_SCALE)]
     """Light in DN below which the response is linear, and logarithmic above; without effect if `dark_dn` is set."""
@@ -65,6 +65,8 @@ class PixelConfig:
     refractory: Annotated[str, one_of(("keep", "reset"))]
     """Fate of a change of light within the refractory period: kept and reported later, or forgotten by a pixel that is
     held in reset, whose reference is then the light at the end of the period."""
+    esim_log_eps: PositiveFloat
+    """Constant that ESIM adds to the intensity in [0, 1] before the logarithm."""
 
     def __post_init__(self):
         if self.photoreceptor_noise and not self.cutoff_hz:

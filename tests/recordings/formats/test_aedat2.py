@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from polarnet.recordings.formats.aedat2 import aedat2_frames
+from polarnet.recordings.formats.aedat import aedat2_frames
 from polarnet.recordings.source import RecordingError
 
 HEADER = b"#!AER-DAT2.0\r\n# AEChip: eu.seebetter.ini.chips.davis.Davis346blue\r\n#End Of ASCII Header\r\n"
