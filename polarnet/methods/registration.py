@@ -25,7 +25,7 @@ from torch.nn import functional as F
 
 from polarnet.networks.polarnet.panorama import displacements
 from polarnet.networks.polarnet.redundancy import block_means
-from polarnet.runtime.compilation import parallel
+from polarnet.runtime.compilation import inlined, parallel
 from polarnet.runtime.sections import section
 
 MIXING = np.array([[1, 1, 1, 1], [2**0.5, 0, -(2**0.5), 0], [0, 2**0.5, 0, -(2**0.5)], [1, -1, 1, -1]], np.float32) / 2
@@ -213,19 +213,16 @@ def _solved(pixels: "_Pixels", x: np.ndarray, y: np.ndarray, start: np.ndarray, 
     weights = np.array([mean, contrast, contrast, contrast], np.float32)
     seen = _coverage(x, y, events.shape[-2:], start.shape[-2:])
     inverse = 1 / (seen + weights.sum() + np.float32(1e-5))
-    buffer = _changes(events)
 
     def applied(images: np.ndarray) -> np.ndarray:
-        _view(images, x, y, buffer)
-        _weigh(buffer, series)
         out = np.float32(1e-5) * images
-        _add_views(buffer, x, y, out)
+        _add_weighed_views(images, x, y, series, out)
         _add_slopes(images, weights, out)
         return out
 
-    _weigh(buffer, series)
-    target = np.zeros_like(start)
-    _add_views(buffer, x, y, target)
+    changes, target = _changes(events), np.zeros_like(start)
+    _weigh(changes, series)
+    _add_views(changes, x, y, target)
     images = start.copy()
     residual = target - applied(images)
     step = inverse * residual
@@ -266,36 +263,60 @@ def _corrections(images: np.ndarray, pixels: _Pixels, x: np.ndarray, y: np.ndarr
     return dx * shorter - (dx * shorter).mean(), dy * shorter - (dy * shorter).mean()
 
 
+@inlined
+def _view_row(image, x, y, i, row):
+    """Row i of the sensor at one time."""
+    top, left = int(y), int(x)
+    down, right = np.float32(y - top), np.float32(x - left)
+    upper, lower = image[top + i, left:], image[top + i + 1, left:]
+    for j in range(row.size):
+        above = upper[j] + right * (upper[j + 1] - upper[j])
+        below = lower[j] + right * (lower[j + 1] - lower[j])
+        row[j] = above + down * (below - above)
+
+
+@inlined
+def _add_row(row, x, y, i, out):
+    """The transpose of `_view_row`, added to `out`."""
+    one = np.float32(1)
+    top, left = int(y), int(x)
+    down, right = np.float32(y - top), np.float32(x - left)
+    for r, share in ((0, one - down), (1, down)):
+        line, following = out[top + i + r, left:], out[top + i + r, left + 1 :]
+        for j in range(row.size):
+            line[j] += share * (one - right) * row[j]
+        for j in range(row.size):
+            following[j] += share * right * row[j]
+
+
+@inlined
+def _weigh_row(rows, series, i, dots):
+    """Subtract the `series` m k h w of row i from its values at all times."""
+    for m in range(series.shape[0]):
+        dots[:] = 0
+        for k in range(rows.shape[0]):
+            for j in range(dots.size):
+                dots[j] += series[m, k, i, j] * rows[k, j]
+        for k in range(rows.shape[0]):
+            for j in range(dots.size):
+                rows[k, j] -= series[m, k, i, j] * dots[j]
+
+
 @parallel
 def _view(images, x, y, out):
     for c in prange(out.shape[0]):
         for k in range(out.shape[1]):
-            top, left = int(y[k]), int(x[k])
-            down, right = np.float32(y[k] - top), np.float32(x[k] - left)
             for i in range(out.shape[2]):
-                upper, lower, row = images[c, top + i], images[c, top + i + 1], out[c, k, i]
-                for j in range(out.shape[3]):
-                    above = upper[left + j] + right * (upper[left + j + 1] - upper[left + j])
-                    below = lower[left + j] + right * (lower[left + j + 1] - lower[left + j])
-                    row[j] = above + down * (below - above)
+                _view_row(images[c], x[k], y[k], i, out[c, k, i])
 
 
 @parallel
-def _add_views(series, x, y, out):
+def _add_views(values, x, y, out):
     """The transpose of `_view`, added to `out`."""
-    one = np.float32(1)
-    for c in prange(series.shape[0]):
-        for k in range(series.shape[1]):
-            top, left = int(y[k]), int(x[k])
-            down, right = np.float32(y[k] - top), np.float32(x[k] - left)
-            for i in range(series.shape[2]):
-                row = series[c, k, i]
-                for r, share in ((0, one - down), (1, down)):
-                    line = out[c, top + i + r]
-                    for j in range(series.shape[3]):
-                        line[left + j] += share * (one - right) * row[j]
-                    for j in range(series.shape[3]):
-                        line[left + j + 1] += share * right * row[j]
+    for c in prange(values.shape[0]):
+        for k in range(values.shape[1]):
+            for i in range(values.shape[2]):
+                _add_row(values[c, k, i], x[k], y[k], i, out[c])
 
 
 @parallel
@@ -303,14 +324,21 @@ def _weigh(values, series):
     for c in prange(values.shape[0]):
         dots = np.empty(values.shape[3], np.float32)
         for i in range(values.shape[2]):
-            for m in range(series.shape[1]):
-                dots[:] = 0
-                for k in range(values.shape[1]):
-                    for j in range(values.shape[3]):
-                        dots[j] += series[c, m, k, i, j] * values[c, k, i, j]
-                for k in range(values.shape[1]):
-                    for j in range(values.shape[3]):
-                        values[c, k, i, j] -= series[c, m, k, i, j] * dots[j]
+            _weigh_row(values[c, :, i], series[c], i, dots)
+
+
+@parallel
+def _add_weighed_views(images, x, y, series, out):
+    """`_view`, `_weigh` and `_add_views`, row by row, so that the views stay in the cache."""
+    for c in prange(series.shape[0]):
+        rows = np.empty((series.shape[2], series.shape[4]), np.float32)
+        dots = np.empty(series.shape[4], np.float32)
+        for i in range(series.shape[3]):
+            for k in range(series.shape[2]):
+                _view_row(images[c], x[k], y[k], i, rows[k])
+            _weigh_row(rows, series[c], i, dots)
+            for k in range(series.shape[2]):
+                _add_row(rows[k], x[k], y[k], i, out[c])
 
 
 def _add_slopes(images: np.ndarray, weights: Float32[np.ndarray, " 4"], out: np.ndarray) -> None:
