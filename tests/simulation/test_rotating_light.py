@@ -3,13 +3,14 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 import torch
+from event_fixtures import equal
 from simulation_fixtures import QUIET, REST, STILL
 
 from polarnet.config.tree import load
-from polarnet.simulation import SENSORS, scene_from_polarization
+from polarnet.simulation import SENSORS, emulate, scene_from_polarization
 from polarnet.simulation.camera import Camera, Grid
 from polarnet.simulation.motion import Sine, Trajectory, resting_trajectory
-from polarnet.simulation.moving_sensor import render_times_us
+from polarnet.simulation.moving_sensor import behind_polarizers, render_times_us
 from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 from polarnet.simulation.sets import emulate_scenes
 from polarnet.storage import EventStore, SceneStore
@@ -33,6 +34,16 @@ def test_unpolarized_light_fires_nothing_and_dolp_one_half_three_events_down_and
     rotating = replace(ROTATING, start_angle_deg=45.0)
     events = still_events(QUIET, uniform_scene(), 450_000, rotating, 1, 1)  # almost a turn, two periods of the light
     assert events.p.tolist() == [-1] * 3 + [1] * 5 + [-1] * 5 + [1] * 5
+
+
+def test_v2e_sees_eight_bits_of_the_light():
+    sensor, scene = replace(SENSORS["clean"], model="v2e"), uniform_scene(0.1, 0.5)
+    t_us = render_times_us(resting_trajectory(4, 6), 200_000, 4, 6, sensor, 1440.0)
+    light = behind_polarizers(scene.stokes.numpy()[:, None].repeat(len(t_us), axis=1), ROTATING.weights(t_us))
+    (expected,), _ = emulate((light[0, :, None] + 0.5).astype(np.uint8), t_us, sensor, key=1)
+    events = still_events(sensor, scene, 200_000)
+    assert len(events) > 100
+    assert equal(events, expected)
 
 
 def test_light_is_rendered_as_often_as_the_polarizer_the_sensor_and_the_motion_need():
