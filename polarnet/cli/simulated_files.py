@@ -33,7 +33,7 @@ COLUMNS: dict[str, type[np.generic]] = {"t": np.int64, "x": np.int16, "y": np.in
 
 
 class Output(NamedTuple):
-    """What to write."""
+    """Place and formats of the files of a simulation."""
 
     folder: Path
     name: str  # of the sequence

@@ -61,6 +61,9 @@ def test_what_cannot_be_converted_is_refused(recording, tmp_path, capsys):
     assert "expected a suffix of .h5, .hdf5, .txt, .raw, or --to FORMAT" in capsys.readouterr().err
     assert main(["convert", str(recording), str(recording)]) == 1
     assert "expected another file than the one to convert" in capsys.readouterr().err
+    for time in ("5ev", "100"):
+        assert main(["convert", str(recording), str(tmp_path / "o.txt"), "--stop", time]) == 1
+        assert f"--stop: expected a time such as 500ms, got {time}" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.txt"]
 
 

@@ -51,6 +51,7 @@ def edit(project: Path, old: str, new: str) -> None:
         ("network=resnet", r"network: expected one of paper"),
         ("train.epochs=many", r"^train\.epochs: expected a valid integer, got 'many'$"),
         ("emulate.randomise={cutof_hz:[30,300]}", r"^emulate.randomise.cutof_hz: expected one of .*, cutoff_hz, .*'$"),
+        ("emulate.randomise={leak_jitter:[0.5,1.5]}", r"^emulate.randomise.leak_jitter: expected <= 1, got"),
         ("loss.msee=1.0", r"loss\.msee is not a setting; loss has half_weight, lpips, mse, ssim"),
         ("seed.x=1", r"seed\.x is not a setting; seed is a value, not a section"),
         (

@@ -41,7 +41,7 @@ def open_shipped(make_setup):
 
 
 def straight_panorama(height: int, width: int) -> Panorama:
-    """What a sensor of 40x60 pixels sees that moves to the right."""
+    """The panorama of a sensor of 40x60 pixels that moves to the right."""
     x = np.arange(10.0)
     return Panorama(np.zeros((4, height, width), np.float32), np.ones((height, width), bool), x, np.zeros(10))
 

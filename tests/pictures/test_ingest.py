@@ -39,16 +39,24 @@ def folder_of(path: Path, count: int) -> str:
 
 @pytest.fixture
 def mixed_folder(tmp_path) -> Path:
-    """Good files among bad ones; tests/pictures/test_images.py reads every format."""
+    """Good files in several formats among bad ones."""
     root = tmp_path / "pictures"
     (root / "deeper").mkdir(parents=True)
     Image.fromarray(photograph(0)).save(root / "good.jpg", quality=95)
+    whole = (root / "good.jpg").read_bytes()
+    (root / "truncated.jpg").write_bytes(whole[: len(whole) // 2])
+    (root / "text.png").write_text("this is text")
+    tifffile.imwrite(root / "grey.tif", photograph(1)[..., 0])
     tifffile.imwrite(root / "deeper" / "deep.TIFF", photograph(2).astype(np.uint16) * 257)
-    for name, seed in (("plain.png", 3), ("same_as_plain.bmp", 3), ("other.png", 4)):
-        Image.fromarray(photograph(seed)).save(root / name)
+    alpha = np.full((110, 160), 77, np.uint8)
+    Image.fromarray(np.dstack([photograph(3), alpha])).save(root / "rgba.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned right by 90 degrees
+    stored = np.ascontiguousarray(np.rot90(photograph(4)))
+    Image.fromarray(stored).save(root / "rotated.jpg", exif=exif, quality=95, subsampling=0)
     Image.fromarray(photograph(5, 50, 50)).save(root / "small.png")
-    for name in ("text.png", "notes.txt"):
-        (root / name).write_text("not a picture")
+    Image.fromarray(photograph(3)).save(root / "same_as_rgba.bmp")
+    (root / "notes.txt").write_text("not a picture, and not meant as one")
     return root
 
 
@@ -56,18 +64,20 @@ def test_good_files_come_in_and_bad_ones_are_named(mixed_folder, tmp_path, caplo
     config = dataclasses.replace(CONFIG, root=str(mixed_folder))
     with caplog.at_level(logging.WARNING):
         manifest = ingest(config, 1, tmp_path / "images", map)
-    origins = ["deeper/deep.TIFF", "good.jpg", "other.png", "plain.png"]
+    origins = ["deeper/deep.TIFF", "good.jpg", "rgba.png", "rotated.jpg"]
     assert sorted(entry.origin for entry in manifest.pictures) == origins
     assert {skipped.file: skipped.reason for skipped in manifest.skipped} == {
+        "truncated.jpg": 'cannot be read: JPEG error: Premature end of JPEG file ("truncated.jpg")',
         "text.png": "cannot be read: Not a PNG file",
+        "grey.tif": "one channel, no RGB: saturation and hue, and so polarization, would be 0 everywhere",
         "small.png": "too small: 50x50 pixels would be enlarged 3.03 times to fill 150x100, "
         "more than ingest.max_upscale=2",
-        "same_as_plain.bmp": "the same pixels as plain.png",
+        "same_as_rgba.bmp": "the same pixels as rgba.png",
     }
     for skipped in manifest.skipped:
         assert f"skipped {skipped.file}: {skipped.reason}" in caplog.messages
     split = {"pictures": 4, "train": 2, "val": 1, "test": 1}
-    assert manifest.counts == split | {"skipped": 3, "ignored_files": 1, "unread_files": 0}
+    assert manifest.counts == split | {"skipped": 5, "ignored_files": 1, "unread_files": 0}
     assert read_manifest(tmp_path / "images") == manifest
     text = (tmp_path / "images" / "manifest.json").read_text()
     assert str(tmp_path) not in text  # no place of this machine

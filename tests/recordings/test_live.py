@@ -85,7 +85,7 @@ def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads
         camera.write(b"0 0 0 1 0\n10 0 0 1 0\n")
         while select.select([source], [], [], 0)[0]:
             time.sleep(0.001)
-        time.sleep(0.05)  # the reading thread may not have taken the time yet
+        time.sleep(0.3)  # the reading thread may not have taken the time yet
         after = time.perf_counter()
         camera.close()
         assert all(before <= piece.read_at <= after for piece in live.pieces)

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import torch
 from event_fixtures import equal
-from simulation_fixtures import QUIET, moving_bars
+from simulation_fixtures import QUIET, REST, STILL, moving_bars
 
 from polarnet.events.stream import concatenate, validate
+from polarnet.simulation import PolarizationScene, Trajectory, emulate_motion
+from polarnet.simulation.camera import Camera, grid
 from polarnet.simulation.emulator import MODELS, Channels, EmulatorConfig, emulate, emulate_frames
 from polarnet.simulation.pixels.columns import MAX_STEP_US
 from polarnet.simulation.presets import SENSORS
+from polarnet.simulation.rotating import RotatingConfig, emulate_rotating
 
 NOISY = dataclasses.replace(
     QUIET, contrast_threshold_sigma_on=0.03, contrast_threshold_sigma_off=0.03, cutoff_hz=100.0, leak_rate_hz=2.0,
@@ -263,6 +266,17 @@ def test_a_step_of_71_minutes_has_its_events_within_it_and_a_longer_one_is_refus
         emulate(STEP, torch.tensor([start_us, start_us + 5e9], dtype=torch.float64), config, key=1)
     with pytest.raises(ValueError, match="at most 4295 s from one frame to the next"):  # after a pause of a live camera
         emulate(STEP[:1], t_us[1:] + 5e9, config, key=1, state=state)
+
+
+@MODEL_NAMES
+def test_a_rotating_and_a_moving_sensor_refuse_long_steps_too(model):
+    scene, rest = PolarizationScene(torch.full((3, 8, 8), 0.1)), Trajectory(3.5, 3.5, REST, REST, STILL, STILL, 0.0)
+    config = of(model, render_rate_hz=2e-4)
+    with pytest.raises(ValueError, match="from one frame to the next, got 5000 s"):
+        emulate_motion(Camera(config, key=1), scene, rest, 5_000_000_000, (4, 4))
+    slow = RotatingConfig(rate_hz=1e-6, start_angle_deg=0.0, extinction_ratio=None, frames_per_turn=32)
+    with pytest.raises(ValueError, match="from one frame to the next, got 5000 s"):
+        emulate_rotating(slow, Camera(config, key=1), scene, rest, 5_000_000_000, grid("four_sensors", 4, 4))
 
 
 @pytest.mark.parametrize("model", ["v2e", "exact"])
