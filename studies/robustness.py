@@ -148,19 +148,20 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
 
 
 def contexts_of(
-    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path], mode: str
+    condition: str, overrides: Sequence[str], train_mean: float, given: argparse.Namespace
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
-    config = settings(*overrides)
-    contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in weights.items()}
-    if mode != PAST:
+    config = settings(*given.set, *overrides)
+    contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in given.weights.items()}
+    if given.mode != PAST:
         return contexts
     variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
+    first = next(iter(given.weights.values()))
     for row, variant in variants.items():
-        contexts[row] = context_of(settings(*overrides, variant), [OURS], train_mean, next(iter(weights.values())))
+        contexts[row] = context_of(settings(*given.set, *overrides, variant), [OURS], train_mean, first)
     return contexts
 
 
@@ -336,25 +337,20 @@ def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
 
 
 def tables_of(
-    conditions: Mapping[str, Condition],
-    sources: Mapping[str, list[float]],
-    train_mean: float,
-    weights: Mapping[str, Path],
-    given: Sequence[str],
-    mode: str,
+    conditions: Mapping[str, Condition], means: Mapping[str, list[float]], train_mean: float, given: argparse.Namespace
 ) -> dict[str, Any]:
-    """Score every condition; returns its table, and one of all measured scenes. `sources` have mean DoLP by scene."""
+    """Score every condition; returns its table, and one of all measured scenes. `means` has the mean DoLP by source."""
     results: dict[str, Scores] = {}
     tables: dict[str, Any] = {}
     for name, parts in conditions.items():
-        others = [mean for source, means in sources.items() if source != name for mean in means]
+        others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
-            config = settings(*given, *overrides)
-            contexts = contexts_of(name, (*given, *overrides), train_mean, weights, mode)
+            config = settings(*given.set, *overrides)
+            contexts = contexts_of(name, overrides, train_mean, given)
             scenes = scenes_of(images, config)
-            kind = name.partition(".")[2] if mode == LAYERS else ""
-            task = functools.partial(scored_sequence, scenes, config, contexts, constant, mode, kind)
+            kind = name.partition(".")[2] if given.mode == LAYERS else ""
+            task = functools.partial(scored_sequence, scenes, config, contexts, constant, given.mode, kind)
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
@@ -381,6 +377,7 @@ def main() -> None:
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
     for mode, about in MODES.items():
         parser.add_argument(f"--{mode.replace('_', '-')}", dest="mode", action="store_const", const=mode, help=about)
+    parser.set_defaults(mode=PAST)
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
@@ -396,12 +393,12 @@ def main() -> None:
         return
     conditions = conditions_of(images, arguments)
     measured = {name: parts for name, parts in conditions.items() if name.startswith("measured.")}
-    sources = {name: [mean for part, _ in of for mean in mean_dolp(part, "test")] for name, of in measured.items()}
+    means = {name: [mean for part, _ in of for mean in mean_dolp(part, "test")] for name, of in measured.items()}
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    mode, wanted = arguments.mode or PAST, tuple(f"{name}." for name in arguments.conditions or conditions)
+    mode, wanted = arguments.mode, tuple(f"{name}." for name in arguments.conditions or conditions)
     conditions = {name: one for name, one in conditions.items() if f"{name}.".startswith(wanted)}
     conditions = {name: one for name, one in conditions.items() if name.startswith(LAYERS) == (mode == LAYERS)}
-    tables = tables_of(conditions, sources, train_mean, arguments.weights, arguments.set, mode)
+    tables = tables_of(conditions, means, train_mean, arguments)
     rows = {name: table["rows"] for name, table in tables.items()}
     if mode == FRAMES:
         ours, with_5, at_rate = (rows["measured"][row] for row in (OURS, WITH_FRAMES, AT_RATE))
