@@ -6,7 +6,6 @@
   damaged, the others, such as one with seed=2, serve for exchanges.
 - kills: writers of stores are killed at a random rename. The old or the new one must be whole, a rerun must work.
 - names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
-- pairs: two commands at once write to one place of the first of --runs (`studies.pairs`).
 
 --only NAME runs one of them; --write puts the counts into docs/results/reliability.json.
 """
@@ -46,7 +45,6 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import read_history
-from studies.pairs import pairs
 from studies.study import ROOT, command_line, measure_sections, read_results
 
 REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and commands end with, in one line
@@ -91,12 +89,7 @@ def values_of(kind: str, folder: Path) -> str:
 
 
 STORES: dict[str, Any] = {"events": EventStore, "frames": FrameStore, "scenes": SceneStore}
-PLACES = {
-    "store": "**/*s.zarr",
-    "images": "images",
-    "training": "train/*",
-    "row": "benchmark/rows/*",
-}
+PLACES = {"store": "**/*s.zarr", "images": "images", "training": "train/*", "row": "benchmark/rows/*"}
 """Folders of each kind of artefact, below `paths.data`."""
 
 
@@ -323,7 +316,6 @@ SECTIONS: dict[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
     "artefacts": lambda given: inject(given.runs, given.faults, seed=1)[0],
     "kills": lambda given: kills(given.kills),
     "names": lambda _: hostile_names(),
-    "pairs": lambda given: pairs(given.runs[0], given.pairs),
 }
 HEADLINES = {
     "stuck": "stuck", "lost": "faults_lost", "silent": "silent_uses", "outside": "outside_writes",
@@ -346,6 +338,5 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=100, help="of stores")
-    parser.add_argument("--pairs", type=int, default=20, help="of each two commands")
     sections = {name: ("reliability", name, functools.partial(measure, name)) for name in SECTIONS}
     measure_sections(parser, sections)

@@ -13,7 +13,7 @@ from polarnet.benchmark.sequences import TestSequence
 from polarnet.config.tree import Config
 from polarnet.events.stream import concatenate
 from polarnet.simulation.emulator import emulate
-from polarnet.simulation.motion import Sine, Trajectory, frame_times_us
+from polarnet.simulation.motion import Sine, Trajectory, frame_times_us, resting_trajectory
 from polarnet.simulation.pixels.light import FULL_SCALE
 from polarnet.simulation.scene import PolarizationScene, scene_from_polarization
 from polarnet.simulation.sets import motion_over
@@ -57,7 +57,8 @@ def layers_of(scenes: SceneStore, name: str, kind: str) -> Layers:
         motion_over(scenes, names[(names.index(name) + k) % len(names)]) for k in range(2)
     )
     if kind == "turning":
-        path, other = _at_rest(path), replace(_at_rest(other), roll=Sine(TURN_RAD, TURNS_RAD_S, 0.0))
+        rest, turn = resting_trajectory(1, 1), Sine(TURN_RAD, TURNS_RAD_S, 0.0)
+        path, other = replace(rest, x=path.x, y=path.y), replace(rest, x=other.x, y=other.y, roll=turn)
     height, width = front.stokes.shape[-2:]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     axes = EXTENT * scenes.sensor_height, EXTENT * scenes.sensor_width
@@ -65,13 +66,6 @@ def layers_of(scenes: SceneStore, name: str, kind: str) -> Layers:
     nothing = torch.zeros(height, width)
     cover = scene_from_polarization(inside.float(), nothing, nothing)
     return Layers((back, path), (front, other), cover, scenes.sensor_height, scenes.sensor_width)
-
-
-def _at_rest(path: Trajectory) -> Trajectory:
-    def still(sines: Sequence[Sine]) -> tuple[Sine, ...]:
-        return tuple(replace(sine, amplitude=0.0) for sine in sines)
-
-    return replace(path, x_sines=still(path.x_sines), y_sines=still(path.y_sines), roll=Sine(0.0, 0.0, 0.0))
 
 
 def layered(scenes: SceneStore, name: str, config: Config, kind: str) -> TestSequence:

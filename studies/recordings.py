@@ -44,6 +44,7 @@ COMMANDS: dict[str, list[str]] = {
     "convert": ["OUT"],
     "recover": ["--method", "highpass", "--mosaic", "90 45 / 135 0", "--write", "zarr", "--out", "OUT"],
 }
+ARRAY = "array"  # stands for `read_recording` among the commands
 MIB = 2**20
 
 
@@ -114,18 +115,13 @@ def peak_mib() -> float:
     return sum(int(line.split()[1]) for mark in marks for line in mark.splitlines() if line.startswith("VmHWM")) / 1024
 
 
-def peak_of_command(command: str, path: str) -> float:
-    """Peak memory in MiB of a command of polarnet on a file."""
+def peak_of(command: str, path: str) -> float:
+    """Peak memory in MiB of a command of polarnet on a file, or of `read_recording`."""
     with tempfile.TemporaryDirectory() as folder:
-        words = [word.replace("OUT", f"{folder}/out.h5") for word in COMMANDS[command]]
-        if polarnet([command, path, *words]):
+        if command == ARRAY:
+            read_recording(path)
+        elif polarnet([command, path, *(word.replace("OUT", f"{folder}/out.h5") for word in COMMANDS[command])]):
             raise RuntimeError(f"polarnet {command} {path} failed")
-    return round(peak_mib(), 1)
-
-
-def peak_of_array(path: str) -> float:
-    """Peak memory in MiB of `read_recording`."""
-    read_recording(path)
     return round(peak_mib(), 1)
 
 
@@ -147,12 +143,11 @@ def measure_memory(_: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder, f"recording{suffix}")
                 write(path, parts(size, *MEMORY_SENSOR))
-                peaks[size] = {name: in_own_process(peak_of_command, name, str(path)) for name in COMMANDS}
-                peaks[size]["array"] = in_own_process(peak_of_array, str(path))
+                peaks[size] = {name: in_own_process(peak_of, name, str(path)) for name in (*COMMANDS, ARRAY)}
         for name in COMMANDS:
             rows[f"{name}, {form}"] = {f"{size // 1_000_000}M": round(one[name]) for size, one in peaks.items()}
         few, many = MEMORY_SIZES[1:3]
-        arrays[form] = round((peaks[many]["array"] - peaks[few]["array"]) * MIB / (many - few), 2)
+        arrays[form] = round((peaks[many][ARRAY] - peaks[few][ARRAY]) * MIB / (many - few), 2)
     return {"commands": rows, "bytes_per_event": arrays}, {"bytes_per_event_max": max(arrays.values())}
 
 

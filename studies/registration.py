@@ -12,9 +12,9 @@ mean; then means over scenes:
 - `panorama, true offset of lines`: a scene that moves straight is compared with itself along its motion alone, so each
   line along the motion has an offset of its own; this row has all of them, 4 pixels apart.
 - `panorama, solved`: the same with the offset that the redundancy I0 + I90 = I45 + I135 gives (`redundant_offset`).
-- `offset`: mean squared offset of `ours`, a figure without truth of anything but polarization.
 """
 
+import argparse
 import statistics
 from collections import defaultdict
 from pathlib import Path
@@ -37,7 +37,7 @@ from polarnet.networks.weights import shipped_weights
 from polarnet.stokes import Prediction
 from studies.robustness import OURS, conditions_of, simulated, warmup_windows
 from studies.scored_pictures import ingested, scenes_of, settings
-from studies.study import arguments_of, command_line, machine_record, write_section
+from studies.study import command_line, measure_sections
 
 THRESHOLD = 0.2  # change of natural-log intensity per event
 LINE = 4  # pixels, width of a line along the motion
@@ -81,7 +81,7 @@ def offset_of_lines(
 
 
 def errors_of(test: TestSequence, first: int) -> dict[str, float]:
-    """Mean squared errors of DoLP by row, that of each frame's own mean, and the mean squared offset of ours."""
+    """Mean squared errors of DoLP by row, and that of each frame's own mean."""
     size = (test.dolp.shape[-2], test.dolp.shape[-1])
     true_dolp, true_aolp = test.dolp[first:], test.aolp[first:]
     valid = torch.ones_like(true_dolp, dtype=torch.bool) if test.valid is None else test.valid[first:]
@@ -110,41 +110,30 @@ def errors_of(test: TestSequence, first: int) -> dict[str, float]:
         "panorama, true offset": error(found + true_offset[:, None, None, None]),
         "panorama, true offset of lines": error(found + offset_of_lines(panorama, truth - found, seen, first + 1)),
         "panorama, solved": error(found + redundant_offset(panorama)[:, None, None, None]),
-        "offset": float(of_ours["offset"].mean()),
     }
 
 
 def table_of(errors: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Ratio of means and of medians over scenes to the oracle mean's MSE, and the mean squared offset."""
-    scenes = list(errors.values())
-    oracle = [one["oracle_mean"] for one in scenes]
-    rows = {}
-    for row in scenes[0]:
-        values = [one[row] for one in scenes]
-        if row not in ("oracle_mean", "offset"):
-            rows[row] = {
-                "mse_over_oracle_mean": statistics.fmean(values) / statistics.fmean(oracle),
-                "median_over_oracle_mean": statistics.median(v / o for v, o in zip(values, oracle, strict=True)),
-            }
-    return {"scenes": len(scenes), "offset": statistics.fmean(one["offset"] for one in scenes), "rows": rows}
+    """Ratio of means over scenes to the oracle mean's MSE, and the median of the scenes' ratios, by row."""
+    columns = {row: [one[row] for one in errors.values()] for row in next(iter(errors.values()))}
+    oracle = columns.pop("oracle_mean")
+    rows = {
+        row: {
+            "mse_over_oracle_mean": statistics.fmean(values) / statistics.fmean(oracle),
+            "median_over_oracle_mean": statistics.median(v / o for v, o in zip(values, oracle, strict=True)),
+        }
+        for row, values in columns.items()
+    }
+    return {"scenes": len(errors), "rows": rows}
 
 
-def main() -> None:
-    """Measure, print and perhaps write."""
-    parser = command_line(__doc__, "section bounds of docs/results/robustness.json")
-    parser.add_argument("--photographs", type=Path, required=True)
-    parser.add_argument("--measured", type=Path, nargs="+", default=[])
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--split", choices=("val", "test"), default="val")
-    parser.add_argument("--limit", type=int, help="pictures of each set")
-    parser.set_defaults(sensor_limit=None)
-    arguments = arguments_of(parser)
-    record, config = machine_record(), settings()
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    photographs = ingested(arguments.photographs, arguments.work / "rgb")
-    conditions = conditions_of({"rgb": photographs}, arguments)
-    parts = {name: images for name, [(images, _)] in conditions.items() if name.startswith(("photographs", "measured"))}
+def measure(given: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Bounds of photographs and of measured scenes."""
+    config = settings()
+    given.work.mkdir(parents=True, exist_ok=True)
+    conditions = conditions_of({"rgb": ingested(given.photographs, given.work / "rgb")}, given)
     errors: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
+    parts = {name: images for name, [(images, _)] in conditions.items() if name.startswith(("photographs", "measured"))}
     for part, images in parts.items():
         scenes = scenes_of(images, config)
         for name in scenes.sequences:
@@ -152,11 +141,15 @@ def main() -> None:
             errors[part.partition(".")[0]][name] = one
             print(name, {row: round(value / one["oracle_mean"], 2) for row, value in one.items()}, flush=True)
     tables = {part: table_of(of_part) for part, of_part in errors.items()}
-    for part, table in tables.items():
-        print(part, table, flush=True)
-    if arguments.write:
-        write_section("robustness", "bounds", {"split": arguments.split, "limit": arguments.limit, **tables}, record)
+    return {"split": given.split, "limit": given.limit, **tables}, {}
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, "section bounds of docs/results/robustness.json")
+    parser.add_argument("--photographs", type=Path, required=True)
+    parser.add_argument("--measured", type=Path, nargs="+", default=[])
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--split", choices=("val", "test"), default="val")
+    parser.add_argument("--limit", type=int, help="pictures of each set")
+    parser.set_defaults(sensor_limit=None)
+    measure_sections(parser, {"bounds": ("robustness", "bounds", measure)})

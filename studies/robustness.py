@@ -16,9 +16,8 @@ for each entry of FRAMES_HZ the same with frames of the camera (`recover --frame
 frames of 10 bits, exposed for 10 ms, with shot noise and the read noise of a DAVIS346. The complementary filter has
 them too. `train_mean` is the mean DoLP of the training photographs, `constant_real` that of the measured scenes of all
 other sources. --split val is for choices, --split test for figures. --limit takes the first N pictures of each set,
---sensor-limit of the sensors alone. Pictures are kept in --work. --write puts the scores into
-docs/results/robustness.json. The second command fills --training with links to the training photographs of both
-folders: a network trained on them (`ingest.root`) has seen no photograph of --split val and --split test.
+--sensor-limit of the sensors alone. Pictures are kept in --work. The second command fills --training with links to the
+training photographs of both folders: a network trained on them (`ingest.root`) has seen none of --split val and test.
 """
 
 import argparse
@@ -63,8 +62,12 @@ from studies.study import arguments_of, command_line, machine_record, write_sect
 
 OURS, WHOLE = "ours", "registered"
 PAST, WHOLE_FILE, FRAMES, LAYERS = "", "whole_file", "frames", "layers"
-"""Modes, after which sections are named: the network sees events so far, those of the whole recording, or also frames;
-or scenes of layers."""
+MODES = {
+    WHOLE_FILE: "the row `registered` beside `ours`",
+    FRAMES: "the same, and with frames; needs measured scenes",
+    LAYERS: "the conditions layers.*, and no others",
+}
+"""Modes, after which sections are named; in `PAST` the network sees events so far alone."""
 CALIBRATED, BLOCKS = "ours, thresholds given", "ours, 2x2 blocks"
 CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
@@ -73,6 +76,8 @@ NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published
 OFFSET = ("offset", "no_offset_mse")  # of atanh(s1) and atanh(s2) in a frame, and the MSE of DoLP without it
 FRAMES_HZ = (1, 5, 20)  # of the camera
 BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`recover --step`), and of the camera's
+WITH_FRAMES = f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"
+AT_RATE = f"{WITH_FRAMES}, at {BETWEEN_HZ} Hz"
 BETWEEN_US = 12_500  # time between those that are scored, every 25th
 EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
 FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
@@ -143,32 +148,33 @@ def conditions_of(images: Mapping[str, Path], arguments: argparse.Namespace) -> 
 
 
 def contexts_of(
-    condition: str, overrides: Sequence[str], train_mean: float, weights: Mapping[str, Path], mode: str
+    condition: str, overrides: Sequence[str], train_mean: float, given: argparse.Namespace
 ) -> dict[str, Context]:
     """Settings of each row of the network under a condition; blocks and known thresholds have the first weights."""
-    config = settings(*overrides)
-    contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in weights.items()}
-    if mode != PAST:
+    config = settings(*given.set, *overrides)
+    contexts = {row: context_of(config, [*ROWS, OURS, WHOLE], train_mean, file) for row, file in given.weights.items()}
+    if given.mode != PAST:
         return contexts
     variants = {BLOCKS: "methods.ours.binning=2"}
     if condition.startswith("sensors.") and not config.emulate.randomise:
         thresholds = f"[{config.emulate.contrast_threshold_on},{config.emulate.contrast_threshold_off}]"
         variants[CALIBRATED] = f"methods.ours.thresholds={thresholds}"
+    first = next(iter(given.weights.values()))
     for row, variant in variants.items():
-        contexts[row] = context_of(settings(*overrides, variant), [OURS], train_mean, next(iter(weights.values())))
+        contexts[row] = context_of(settings(*given.set, *overrides, variant), [OURS], train_mean, first)
     return contexts
 
 
 def scored_sequence(
-    name: str,
     scenes: SceneStore,
     config: Config,
     contexts: Mapping[str, Context],
     constant: float,
     mode: str,
-    kind: str | None,
+    kind: str,
+    name: str,
 ) -> Scores:
-    """Scores of all methods on one sequence, of the `kind` of layers if any, without the windows of the warm-up."""
+    """Scores of all methods on one sequence, of a `kind` of layers unless empty, without the windows of the warm-up."""
     test = layers.layered(scenes, name, config, kind) if kind else simulated(scenes, name, config)
     first_context = next(iter(contexts.values()))
     rows, _ = available(ROWS, first_context)
@@ -251,12 +257,7 @@ def between_windows(
     t_us = t_us[1:] * (10**6 // BETWEEN_HZ)
     truth = sequence_at(scenes, test.name, test.events, torch.from_numpy(np.concatenate([[0], t_us])))
     assert recoverer.between is not None
-    return truth, {between_row(): recoverer.between(state, t_us)}
-
-
-def between_row() -> str:
-    """Name of the row of frames between windows."""
-    return f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s, at {BETWEEN_HZ} Hz"
+    return truth, {AT_RATE: recoverer.between(state, t_us)}
 
 
 def camera_frames(scenes: SceneStore, name: str, stop_us: int, rate_hz: float) -> StokesFrames:
@@ -320,30 +321,23 @@ def table_of(scores: Scores) -> dict[str, Any]:
 
 def headlines(tables: Mapping[str, Any], row: str) -> dict[str, Any]:
     """Figures of one row that stand above the sections of docs/results/robustness.json."""
-    figures: dict[str, Any] = {
-        name: {"mse_over_oracle_mean": tables[name]["rows"][row]["mse_over_oracle_mean"]}
-        for name in ("photographs", "photographs_large")
-        if name in tables
-    }
-    if "measured" in tables:
+    own, to_mean = {name: table["rows"][row] for name, table in tables.items()}, "mse_over_oracle_mean"
+    photographs = own.keys() & {"photographs", "photographs_large"}
+    figures: dict[str, Any] = {name: {to_mean: own[name][to_mean]} for name in sorted(photographs)}
+    if measured := own.get("measured"):
         rows = tables["measured"]["rows"]
         best = min(rows[name]["mse"] for name in NO_TRUTH if name in rows)
-        ratios = {key: rows[row][key] for key in ("mse_over_oracle_mean", "median_over_oracle_mean")}
-        figures["measured"] = {"mse_over_best_baseline": rows[row]["mse"] / best, **ratios}
-        figures["calibration"] = {"measured_factor": rows[row]["error_factor"]}
-    errors = {name: table["rows"][row]["mse"] for name, table in tables.items() if name.startswith("sensors.")}
+        ratios = {key: measured[key] for key in (to_mean, "median_over_oracle_mean")}
+        figures["measured"] = {"mse_over_best_baseline": measured["mse"] / best, **ratios}
+        figures["calibration"] = {"measured_factor": measured["error_factor"]}
+    errors = {name: one["mse"] for name, one in own.items() if name.startswith("sensors.")}
     if "sensors.default" in errors:
         figures["sensors"] = {"worst_over_default": max(errors.values()) / errors["sensors.default"]}
     return figures
 
 
 def tables_of(
-    conditions: Mapping[str, Condition],
-    means: Mapping[str, list[float]],
-    train_mean: float,
-    weights: Mapping[str, Path],
-    common: Sequence[str],
-    mode: str,
+    conditions: Mapping[str, Condition], means: Mapping[str, list[float]], train_mean: float, given: argparse.Namespace
 ) -> dict[str, Any]:
     """Score every condition; returns its table, and one of all measured scenes. `means` has the mean DoLP by source."""
     results: dict[str, Scores] = {}
@@ -352,18 +346,11 @@ def tables_of(
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
-            config = settings(*common, *overrides)
-            contexts = contexts_of(name, (*common, *overrides), train_mean, weights, mode)
+            config = settings(*given.set, *overrides)
+            contexts = contexts_of(name, overrides, train_mean, given)
             scenes = scenes_of(images, config)
-            task = functools.partial(
-                scored_sequence,
-                scenes=scenes,
-                config=config,
-                contexts=contexts,
-                constant=constant,
-                mode=mode,
-                kind=name.removeprefix("layers.") if name.startswith("layers.") else None,
-            )
+            kind = name.partition(".")[2] if given.mode == LAYERS else ""
+            task = functools.partial(scored_sequence, scenes, config, contexts, constant, given.mode, kind)
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])
@@ -388,9 +375,9 @@ def main() -> None:
     parser.add_argument("--conditions", nargs="+", help="only these, such as photographs measured sensors.noisy")
     parser.add_argument("--limit", type=int, help="pictures of each set")
     parser.add_argument("--sensor-limit", type=int, help="pictures of each sensor; default: as --limit")
-    parser.add_argument("--whole-file", action="store_true", help="the row `registered` beside `ours`")
-    parser.add_argument("--frames", action="store_true", help="the same, and with frames; needs measured scenes")
-    parser.add_argument("--layers", action="store_true", help="the conditions layers.*, and no others")
+    for mode, about in MODES.items():
+        parser.add_argument(f"--{mode.replace('_', '-')}", dest="mode", action="store_const", const=mode, help=about)
+    parser.set_defaults(mode=PAST)
     arguments = arguments_of(parser)
     pairs = [given.rpartition("=") for given in arguments.weights]
     arguments.weights = {name or OURS: Path(file).resolve() for name, _, file in pairs} or {OURS: shipped_weights()}
@@ -405,33 +392,24 @@ def main() -> None:
         print(f"{link_training(roots, images, arguments.training)} photographs in {arguments.training}")
         return
     conditions = conditions_of(images, arguments)
-    means = {
-        name: [mean for part, _ in parts for mean in mean_dolp(part, "test")]
-        for name, parts in conditions.items()
-        if name.startswith("measured.")
-    }
+    measured = {name: parts for name, parts in conditions.items() if name.startswith("measured.")}
+    means = {name: [mean for part, _ in of for mean in mean_dolp(part, "test")] for name, of in measured.items()}
     train_mean = statistics.fmean(mean_dolp(images["rgb"], "train"))
-    chosen = [name for name in (FRAMES, LAYERS, WHOLE_FILE) if getattr(arguments, name)]
-    mode = chosen[0] if chosen else PAST
-    if wanted := arguments.conditions:
-        conditions = {
-            name: one for name, one in conditions.items() if f"{name}.".startswith(tuple(f"{w}." for w in wanted))
-        }
+    mode, wanted = arguments.mode, tuple(f"{name}." for name in arguments.conditions or conditions)
+    conditions = {name: one for name, one in conditions.items() if f"{name}.".startswith(wanted)}
     conditions = {name: one for name, one in conditions.items() if name.startswith(LAYERS) == (mode == LAYERS)}
-    tables = tables_of(conditions, means, train_mean, arguments.weights, arguments.set, mode)
+    tables = tables_of(conditions, means, train_mean, arguments)
+    rows = {name: table["rows"] for name, table in tables.items()}
     if mode == FRAMES:
-        rows = tables["measured"]["rows"]
-        with_5, at_rate = rows[f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"], rows[between_row()]
-        ratio, change = with_5["mse"] / rows[OURS]["mse"], at_rate["psnr"] - with_5["psnr"]
+        ours, with_5, at_rate = (rows["measured"][row] for row in (OURS, WITH_FRAMES, AT_RATE))
+        ratio, change = with_5["mse"] / ours["mse"], at_rate["psnr"] - with_5["psnr"]
         figures = {FRAMES: {"mse_over_events_only": ratio, f"psnr_change_at_{BETWEEN_HZ}_hz": change}}
     elif mode == LAYERS:
-        rows = {name: table["rows"] for name, table in tables.items()}
         figures = {LAYERS: {name: of[WHOLE]["mse"] / of[OURS]["mse"] for name, of in rows.items()}}
     elif mode == WHOLE_FILE:
         figures = {mode: headlines(tables, WHOLE)}
-        if "measured" in tables:
-            rows = tables["measured"]["rows"]
-            figures["measured"] = {"offset_over_before": rows[WHOLE]["offset"] / rows[OURS]["offset"]}
+        if of := rows.get("measured"):
+            figures["measured"] = {"offset_over_before": of[WHOLE]["offset"] / of[OURS]["offset"]}
     else:
         figures = headlines(tables, next(iter(arguments.weights)))
     print(json.dumps(figures, indent=1))

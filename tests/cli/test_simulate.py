@@ -16,6 +16,7 @@ from polarnet.cli import main, simulated_files
 from polarnet.clips import simulate_video, video
 from polarnet.events.mosaic import split_mosaic
 from polarnet.events.stream import Events
+from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import fit, read_rgb
 from polarnet.pictures.polarimetry import demosaic
 from polarnet.recordings.recording import read_recording
@@ -330,8 +331,9 @@ def test_demo_recovers_a_photograph_better_than_its_mean(tmp_path, capsys):
     assert error.mean() < truth[6:].var(axis=(1, 2)).mean()
 
 
-def test_a_demo_is_refused_where_another_process_writes_one(tmp_path, capsys):
-    with FileLock(tmp_path / "demo.lock.tmp"):
-        assert main(["demo", "--out", str(tmp_path / "demo"), *SMALL]) == 1
-    assert f"{tmp_path / 'demo'}: another process is writing it" in capsys.readouterr().err
-    assert not (tmp_path / "demo").exists()
+@pytest.mark.parametrize("command", [["demo"], ["simulate", str(BUILTIN_PHOTOS[0].path)]], ids=lambda words: words[0])
+def test_a_command_is_refused_where_another_process_writes(command, tmp_path, capsys):
+    with FileLock(tmp_path / "out.lock.tmp"):
+        assert main([*command, "--out", str(tmp_path / "out"), *SMALL]) == 1
+    assert f"{tmp_path / 'out'}: another process is writing it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -10,7 +10,7 @@ from polarnet.recordings.recording import read_recording
 
 pytest.importorskip("rosbags", reason="the extra rosbag is not installed")
 
-from studies.rosbag_writer import two_arrays, write_bag
+from studies.recording_files import two_arrays, write_bag
 
 COMMANDS = {
     "inspect": ("--out", "out"),

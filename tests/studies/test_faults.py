@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.events.stream import Events
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.pictures.images import write_png
 from polarnet.pictures.manifest import Manifest, ManifestEntry, write_manifest
 from polarnet.runtime.files import seal
-from polarnet.storage.events import EventStore
 from polarnet.training.engine.recorder import write_history
 from studies import faults
 
@@ -42,12 +40,7 @@ def run(project_root, tmp_path):
     save_checkpoint(training / "best.safetensors", {"w": torch.rand(99)}, {"network": "x", "config": {}, "val": 0.25})
     write_history(training, [{"epoch": 0, "train": {"total": 0.5}, "val": {"mse": 0.125}}])
     seal(training)
-    store = EventStore.create(data / "events.zarr", ["a", "b"], 8, 12, {"seed": 1})
-    for name in ("a", "b"):
-        t = torch.from_numpy(np.sort(generator.integers(0, 5000, 50)))
-        x, y = (torch.from_numpy(generator.integers(0, side, 50)).short() for side in (12, 8))
-        store.write(name, [Events(t, x, y, torch.ones(50, dtype=torch.int8), 8, 12)] * 4, 5000)
-    store.finish()
+    faults.write_store(data / "events.zarr", "1", ["a", "b"])
     return tmp_path
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
-from studies.rosbag_writer import PACKET, packet_bytes, two_arrays, write_bag
+from studies.recording_files import PACKET, packet_bytes, two_arrays, write_bag
 
 EVENTS = [(5, 3, 4, 1), (1_000_009, 7, 0, -1), (1_000_010, 0, 5, 1)]
 
