@@ -57,7 +57,7 @@ def why_unfinished(job: Path, record: Mapping[str, Any]) -> str | None:
     before = _read(job / FINISHED)
     if before is None:
         return "it has not finished"
-    change = first_difference(before, json.loads(json.dumps(record)), "")
+    change = first_difference(before, json.loads(json.dumps(record)))
     return change and f"{change[0]} was {change[1]}, is {change[2]}"
 
 
