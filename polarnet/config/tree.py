@@ -34,7 +34,6 @@ from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
-from polarnet.terminal.environment import INTERRUPTED, STOPPED
 from polarnet.training.baselines import BASELINES
 from polarnet.training.engine.loop import LoopConfig, TrainConfig
 from polarnet.training.engine.losses import LossConfig
@@ -327,9 +326,6 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
                 f"{error.filename}: this folder cannot be written; give hydra.run.dir=FOLDER for the logs, "
                 "paths.data and paths.resume for the results"
             ) from None
-        except KeyboardInterrupt:
-            print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
-            raise SystemExit(INTERRUPTED) from None
 
     return command_line
 
