@@ -93,7 +93,7 @@ class Run:
                 raise ValueError(problem)
 
     def write_origins(self) -> None:
-        """Write the origin of each folder that the stages made."""
+        """Write the origin of each folder that the stages made, with a checksum of its own."""
         for stage in self.stages:
             values: dict[str, Any] = {}
             inputs = {artefact: self._content_of(artefact) for artefact in self.made_inputs(stage)}
@@ -103,7 +103,10 @@ class Run:
             values |= {key: _value_at(self.values, key) for key in stage.params if key not in UNCOMPARED}
             for out, folder in ((out, self.config.place(out)) for out in stage.outs):
                 if folder.is_dir():
-                    write_origin(folder, Origin(out, digest(folder), inputs, values))
+                    content = Origin(out, digest(folder), inputs, values)._asdict()
+                    record = {**content, "sha256": _checksum(content)}
+                    with replaced(folder / ORIGIN) as temporary:
+                        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
     def made_inputs(self, stage: Stage) -> list[str]:
         """The artefacts of other stages that a stage reads: its `deps`, or what they hold or are part of."""
@@ -165,14 +168,6 @@ class Origin(NamedTuple):
     """`digest` of each artefact that it was made from, by name."""
     values: dict[str, Any]
     """The values that it and its inputs were made with, by key of params.yaml; a key may name a section."""
-
-
-def write_origin(folder: Path, origin: Origin) -> None:
-    """Write the origin of a folder, with a checksum of its own."""
-    content = json.loads(json.dumps(origin._asdict()))
-    with replaced(folder / ORIGIN) as temporary:
-        record = {**content, "sha256": _checksum(content)}
-        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read_origin(folder: Path) -> Origin | None:

@@ -15,7 +15,6 @@ has its zarr.json, which is copied last. The same sequences give the same bytes,
 """
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import json
@@ -29,7 +28,7 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
 import fsspec
 import numpy as np
@@ -83,11 +82,9 @@ class Store:
     """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
-        known, kind = {"digests": {}, **header}, cast("Any", type(self))
-        keys = _header_class(kind)
-        names = [field.name for field in dataclasses.fields(keys) if field.name in known]
-        checked = keys(**{name: known[name] for name in names})
-        vars(self).update({name: getattr(checked, name) for name in names})
+        kind = _header_class(type(self))
+        known = {name: value for name, value in ({"digests": {}} | header).items() if name in kind.__dataclass_fields__}
+        vars(self).update(vars(kind(**known)))
         self.path, self.header = path, header
         _check_names(self.sequences)
         starts = range(0, len(self.sequences), self.sequences_per_part)
