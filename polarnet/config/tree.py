@@ -314,13 +314,7 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_overrides(Config, root, overrides))
         logging.captureWarnings(True)
-        try:
-            run()
-        except PermissionError as error:
-            raise SystemExit(
-                f"{error.filename}: this folder cannot be written; give hydra.run.dir=FOLDER for the logs, "
-                "paths.data and paths.resume for the results"
-            ) from None
+        run()
 
     return command_line
 
