@@ -295,8 +295,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
         or_refuse(lambda: main(config), f"stage {script}")
-        if os.environ.get("RANK", "0") == "0":  # the first process of a training that several share
-            run.write_origins()
+        run.write_origins()
 
     return hydra_command(checked)
 
