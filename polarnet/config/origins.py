@@ -68,8 +68,8 @@ def pipeline(root: Path, params: Mapping[str, Any]) -> dict[str, Stage]:
         for key in items:
             full = f"{name}@{key}".removesuffix("@")
             stage = filled(one, key, items[key] if isinstance(items, dict) else key)
-            command, params, deps = shlex.split(stage["cmd"]), stage.get("params", []), stage.get("deps", [])
-            stages[full] = Stage(full, command, params, deps, stage["outs"])
+            command, keys, deps = shlex.split(stage["cmd"]), stage.get("params", []), stage.get("deps", [])
+            stages[full] = Stage(full, command, keys, deps, stage["outs"])
     return stages
 
 

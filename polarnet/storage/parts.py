@@ -82,9 +82,9 @@ class Store:
     """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
-        kind = _header_class(type(self))
-        known = {name: value for name, value in ({"digests": {}} | header).items() if name in kind.__dataclass_fields__}
-        vars(self).update(vars(kind(**known)))
+        kind: Any = type(self)
+        known, keys = {"digests": {}, **header}, _header_class(kind)
+        vars(self).update(vars(keys(**{name: known[name] for name in keys.__dataclass_fields__ if name in known})))
         self.path, self.header = path, header
         _check_names(self.sequences)
         starts = range(0, len(self.sequences), self.sequences_per_part)
