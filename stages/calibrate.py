@@ -23,10 +23,7 @@ def main(config: Config) -> None:
     folders = sorted(path for path in root.iterdir() if path.is_dir())
     if not folders:
         raise SystemExit(f"{root}: expected a folder for each target with its eight captures, there is none")
-    try:
-        targets = calibrate_targets(folders, out, config.recordings, about)
-    except ValueError as error:
-        raise SystemExit(str(error)) from None
+    targets = calibrate_targets(folders, out, config.recordings, about)
     events, frames = EventStore.open(out / "events.zarr"), FrameStore.open(out / "frames.zarr")
     for target in targets:
         draw_calibration(target, config.recordings, out / f"{target.name}.png")

@@ -5,7 +5,6 @@ import os
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
 
 from polarnet.config.benchmark_tables import collect_rows, copy_histories
 from polarnet.config.experiments import changed_values
@@ -17,11 +16,6 @@ from polarnet.reports.tables import as_plain
 
 PLUMBING = ("networks", "rows", "row", "baseline", "paths", "runtime", "cluster")
 """Sections that affect no result, and the networks, of which the page shows the one in use."""
-
-
-def plain(value: Any) -> Any:
-    """A section as a dict; other values as they are."""
-    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
 
 
 def command_line(root: Path) -> str:
@@ -44,9 +38,12 @@ def main(config: Config) -> None:
     for name in tables:
         print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
-    shown = [field.name for field in dataclasses.fields(config) if field.name not in PLUMBING]
-    parameters = {name: plain(getattr(config, name)) for name in shown}
-    parameters["networks"] = {config.network: plain(config.network_config)}
+    parameters = {
+        name: value if isinstance(value, int | str) else dataclasses.asdict(value)
+        for name, value in vars(config).items()
+        if name not in PLUMBING
+    }
+    parameters["networks"] = {config.network: dataclasses.asdict(config.network_config)}
     root = Path(__file__).resolve().parent.parent
     run = Run(command_line(root), parameters, {"seed": str(config.seed)} | facts(root))
     print(f"the report: {write_report(paths, config.used_baselines, run, Path(config.paths.report))}")

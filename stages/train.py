@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage, or_exit
+from polarnet.config.tree import DOLP_TRAINING, Config, hydra_stage
 from polarnet.metrics.lpips import Lpips
 from polarnet.runtime.machine import device_of
 from polarnet.storage.events import EventStore
@@ -22,7 +22,7 @@ from polarnet.training.engine.task import Task, describe, open_split
 def main(config: Config) -> None:
     """Train one network on the training split; a killed run of the same training resumes."""
     device = device_of(config.runtime)
-    settings, task = or_exit(lambda: _task(config, device))
+    settings, task = _task(config, device)
     paths = config.paths
     split = open_split(EventStore.open(paths.events), paths.frames, task.encode)
     metadata = describe(task, split, settings, config.lpips.backbone, config.seed, device)

@@ -65,7 +65,7 @@ def _failure_of_point(node: DictConfig, job: Path) -> str | None:
     run = Run(ROOT, config, "trial")
     plan, inputs = _plan(run)
     values = {name: value for name, value in dataclasses.asdict(config).items() if name not in CHANGES_NO_RESULT}
-    digests = {dep: digest([config.place(dep)]) for dep in inputs}
+    digests = {dep: digest(config.place(dep)) for dep in inputs}
     record = {"values": values, "inputs": digests, "code": code_digest()}
     reason = why_unfinished(job, record)
     if reason is None:

@@ -58,7 +58,8 @@ def write_row(folder: Path, row: str, record: RowRecord, sets: Mapping[str, Benc
         }
         (folder / name / "results.json").write_text(json.dumps(results) + "\n")
         for panel in benchmark.panels:
-            write_panel(folder / name / "panels", panel, [row])
+            own = dataclasses.replace(panel, predictions={row: panel.predictions[row]})
+            write_panel(folder / name / "panels", own)
     (folder / "row.json").write_text(json.dumps(record._asdict(), indent=2) + "\n")
     seal(folder)
     publish(folder, place)

@@ -1,9 +1,7 @@
 """Presets of conf/ and overrides of a command line, checked before Hydra reads them or written into params.yaml."""
 
-import fnmatch
 import functools
 import json
-import re
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +21,6 @@ MAPPINGS = ("randomise",)
 
 GROUPS = ("experiment", "sensor", "polarizers")
 """Folders of conf/ whose presets can be written into params.yaml."""
-CHOICES = re.compile(r"(?:glob\()?([^()=]*)\)?")
 MAX_DEPTH = 20
 MAX_VALUES = 10_000  # of params.yaml; it has some hundred
 
@@ -160,13 +157,12 @@ def _check_params(settings: type, file: Path) -> None:
 
 
 def _check_choices(roots: Sequence[Path], group: str, value: str) -> None:
-    """Raise ValueError if a name or pattern for `group`, alone, in a list or in glob(...), matches no file.
+    """Raise ValueError if a name for `group`, alone or in a list, is that of no file.
 
-    Other Hydra syntax, such as choice(...), is left to Hydra to check.
+    Other Hydra syntax, such as glob(...), is left to Hydra to check.
     """
     known = sorted({name for root in roots for name in preset_names(root, group)})
-    plain = CHOICES.fullmatch(value)
-    for name in (word.strip("[]'\" ") for word in (plain[1].split(",") if plain else [])):
-        if not fnmatch.filter(["null", *known], name):
+    for name in (word.strip("[]'\" ") for word in value.split(",") if "(" not in value):
+        if name not in ("null", *known):
             near = did_you_mean(name, known)
             raise ValueError(f"{group}: there is no {name!r}; conf/{group} has {', '.join(known)}{near}")

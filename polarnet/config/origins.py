@@ -9,13 +9,12 @@ compared with their files, with each other and with the configuration.
 import dataclasses
 import functools
 import json
-import operator
-import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from omegaconf import OmegaConf
 from ruamel.yaml import YAML
 
 from polarnet.runtime.files import ORIGIN, REMAKE, files_of, replaced, sha256
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 
 UNCOMPARED = ("rows",)
 """Keys that decide whether an artefact is made at all, not what it holds."""
-TEMPLATE = re.compile(r"\$\{([^}]+)\}")
 MAX_HASHED = 2**16  # bytes; larger files of a store or training have checksums in smaller ones
 ABSENT = "nothing"
 
@@ -55,37 +53,24 @@ def pipeline(root: Path, params: Mapping[str, Any]) -> dict[str, Stage]:
 
     A stage with `foreach` becomes one stage, NAME@ITEM, for each item of a list or key of a mapping in `params`.
     """
-    stages = {}
+    values: Any = OmegaConf.create(dict(params))
+    stages: dict[str, Stage] = {}
+
+    def filled(content: Any, key: str = "", item: Any = None) -> Any:
+        """The content with values in place of DVC's templates, which are OmegaConf's interpolations."""
+        values.key, values.item, values.content = key, item, content
+        return OmegaConf.to_container(values.content, resolve=True)
+
     for name, content in YAML(typ="safe").load(root / "dvc.yaml")["stages"].items():
-        for item, values in _items(content, params):
-            full = name if item is None else f"{name}@{item}"
-            one = _filled(content.get("do", content), {**params, **values})
-            outs = [out if isinstance(out, str) else next(iter(out))
-                    for out in (*one.get("outs", ()), *one.get("metrics", ()))]  # fmt: skip
-            stages[full] = Stage(full, shlex.split(one["cmd"]), one.get("params", []), one.get("deps", []), outs)
+        one, items = content.get("do", content), filled(content["foreach"]) if "foreach" in content else {"": None}
+        made = [*one.get("outs", ()), *one.get("metrics", ())]
+        one = one | {"outs": [out if isinstance(out, str) else next(iter(out)) for out in made]}
+        for key in items:
+            full = f"{name}@{key}".removesuffix("@")
+            stage = filled(one, key, items[key] if isinstance(items, dict) else key)
+            command, keys, deps = shlex.split(stage["cmd"]), stage.get("params", []), stage.get("deps", [])
+            stages[full] = Stage(full, command, keys, deps, stage["outs"])
     return stages
-
-
-def _items(content: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[tuple[str | None, dict[str, Any]]]:
-    if "foreach" not in content:
-        yield None, {}
-        return
-    items = _filled(content["foreach"], params)
-    for item in items:
-        yield item, {"key": item, "item": items[item] if isinstance(items, dict) else item}
-
-
-def _filled(content: Any, values: Mapping[str, Any]) -> Any:
-    """Replace the templates in all texts of `content`, as DVC does."""
-    if isinstance(content, dict):
-        return {_filled(key, values): _filled(value, values) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_filled(value, values) for value in content]
-    if not isinstance(content, str):
-        return content
-    if whole := TEMPLATE.fullmatch(content):
-        return functools.reduce(operator.getitem, whole[1].split("."), values)
-    return TEMPLATE.sub(lambda m: str(functools.reduce(operator.getitem, m[1].split("."), values)), content)
 
 
 class Run:
@@ -98,7 +83,8 @@ class Run:
         of_script = [stage for stage in self.pipeline.values() if stage.script == script]
         exact = [stage for stage in of_script if set(stage.overrides) == chosen]
         self.stages = exact or ([] if chosen else of_script)  # without `row`, a script runs all rows
-        self._contents: dict[str, str] = {}
+        self._content_of = functools.cache(lambda artefact: digest(config.place(artefact)))
+        """Digest of an artefact's folder at the first call: what the stages of this run read."""
 
     def check_inputs(self) -> None:
         """ValueError for the first artefact that is not what its name says, or was made from others than those here."""
@@ -107,19 +93,20 @@ class Run:
                 raise ValueError(problem)
 
     def write_origins(self) -> None:
-        """Write the origin of each folder that the stages made."""
+        """Write the origin of each folder that the stages made, with a checksum of its own."""
         for stage in self.stages:
             values: dict[str, Any] = {}
-            made = self.made_inputs(stage)
-            for artefact in made:
+            inputs = {artefact: self._content_of(artefact) for artefact in self.made_inputs(stage)}
+            for artefact in inputs:
                 if origin := read_origin(self.config.place(artefact)):
                     values |= origin.values
-            for key in (key for key in stage.params if key not in UNCOMPARED):
-                values[key] = functools.reduce(operator.getitem, key.split("."), self.values)
-            inputs = {artefact: self._content_of(artefact) for artefact in made}
+            values |= {key: _value_at(self.values, key) for key in stage.params if key not in UNCOMPARED}
             for out, folder in ((out, self.config.place(out)) for out in stage.outs):
                 if folder.is_dir():
-                    write_origin(folder, Origin(out, digest([folder]), inputs, values))
+                    content = Origin(out, digest(folder), inputs, values)._asdict()
+                    record = {**content, "sha256": _checksum(content)}
+                    with replaced(folder / ORIGIN) as temporary:
+                        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
     def made_inputs(self, stage: Stage) -> list[str]:
         """The artefacts of other stages that a stage reads: its `deps`, or what they hold or are part of."""
@@ -142,7 +129,8 @@ class Run:
         if origin is None or maker is None:
             return None
         command = shlex.join(maker.command)
-        if change := self.change_since(origin):
+        values = {key: _value_at(self.values, key) for key in origin.values}
+        if change := first_difference(origin.values, json.loads(json.dumps(values))):
             key, was, now = change
             return (
                 f"{key}: {place} was made with {was}, this run has {now}; make it again with this value (`dvc repro "
@@ -157,23 +145,6 @@ class Run:
             if self.config.place(source).is_dir() and self._content_of(source) != was:
                 return f"{place} was made from another {self.config.place(source)} than the one there now; {again}"
         return None
-
-    def change_since(self, origin: "Origin") -> tuple[str, Any, Any] | None:
-        """Key, old and new value of the first value that differs from an origin; None if all are equal."""
-        now = json.loads(json.dumps(self.values))
-        for key, was in origin.values.items():
-            value: Any = now
-            for part in key.split("."):
-                value = value.get(part, ABSENT) if isinstance(value, dict) else ABSENT
-            if change := first_difference(was, value, key):
-                return change
-        return None
-
-    def _content_of(self, artefact: str) -> str:
-        """Digest of an artefact's folder at the first call: what the stages of this run read."""
-        if artefact not in self._contents:
-            self._contents[artefact] = digest([self.config.place(artefact)])
-        return self._contents[artefact]
 
     def is_stale(self, stage: Stage) -> bool:
         """Whether an output of a stage is missing, has no origin, or cannot be used with this configuration."""
@@ -199,14 +170,6 @@ class Origin(NamedTuple):
     """The values that it and its inputs were made with, by key of params.yaml; a key may name a section."""
 
 
-def write_origin(folder: Path, origin: Origin) -> None:
-    """Write the origin of a folder, with a checksum of its own."""
-    content = json.loads(json.dumps(origin._asdict()))
-    with replaced(folder / ORIGIN) as temporary:
-        record = {**content, "sha256": _checksum(content)}
-        temporary.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
 def read_origin(folder: Path) -> Origin | None:
     """The origin in a folder; None if there is none, ValueError if it is not as it was written."""
     file = folder / ORIGIN
@@ -228,7 +191,7 @@ def origin_problems(folder: Path) -> list[str]:
         origin = read_origin(folder)
     except ValueError as error:
         return [str(error)]
-    if origin is None or origin.content == digest([folder]):
+    if origin is None or origin.content == digest(folder):
         return []
     return [f"{folder}: its files are not those that {folder / ORIGIN} describes; {REMAKE}"]
 
@@ -237,7 +200,14 @@ def _checksum(content: Mapping[str, Any]) -> str:
     return sha256(json.dumps(content, sort_keys=True).encode())
 
 
-def first_difference(was: Any, now: Any, key: str) -> tuple[str, Any, Any] | None:
+def _value_at(values: Any, key: str) -> Any:
+    """The value at a dotted key of nested mappings; `ABSENT` if there is none."""
+    for part in key.split("."):
+        values = values.get(part, ABSENT) if isinstance(values, dict) else ABSENT
+    return values
+
+
+def first_difference(was: Any, now: Any, key: str = "") -> tuple[str, Any, Any] | None:
     """Key below `key`, old and new value of the first difference of two values of JSON; None if they are equal."""
     if isinstance(was, dict) and isinstance(now, dict):
         for name in {**was, **now}:
@@ -247,14 +217,13 @@ def first_difference(was: Any, now: Any, key: str) -> tuple[str, Any, Any] | Non
     return None if was == now else (key, was, now)
 
 
-def digest(paths: Iterable[Path]) -> str:
-    """Hash of folders or files by the names and sizes of all files and the content of small ones, without origins.
+def digest(path: Path) -> str:
+    """Hash of a folder or file by the names and sizes of all files and the content of small ones, without origins.
 
     The small files of an artefact (headers, SHA256SUMS) hold the checksums of its large ones.
     """
     parts = []
-    for path in paths:
-        for file in files_of(path):
-            parts.append(f"{file.relative_to(path)}\0{(size := file.stat().st_size)}\0".encode())
-            parts += [file.read_bytes()] if size <= MAX_HASHED else []
+    for file in files_of(path):
+        parts.append(f"{file.relative_to(path)}\0{(size := file.stat().st_size)}\0".encode())
+        parts += [file.read_bytes()] if size <= MAX_HASHED else []
     return sha256(*parts)

@@ -9,7 +9,7 @@ from polarnet.benchmark.results import RowRecord, write_row
 from polarnet.benchmark.rows import Context, available, weights_used
 from polarnet.benchmark.run import run_benchmark
 from polarnet.benchmark.sequences import BenchmarkSet, train_mean_dolp
-from polarnet.config.tree import Config, or_exit
+from polarnet.config.tree import Config
 from polarnet.events.rotation import steady_rotation
 from polarnet.methods import METHODS, is_rotating
 from polarnet.methods.method import Method, Setup
@@ -96,7 +96,7 @@ def set_names(config: Config) -> list[str]:
 def run_rows(config: Config, rows: Sequence[str]) -> None:
     """Run rows on every test set, in one pass over the events of each, and write a folder of each row.
 
-    A row that cannot run gets a folder with the reason. SystemExit if LPIPS weights are missing.
+    A row that cannot run gets a folder with the reason. ValueError if LPIPS weights are missing.
     """
     needs_mean = any(row in REFERENCES and REFERENCES[row].needs_train_mean for row in rows)
     context = context_of(config, rows, train_mean_of(config) if needs_mean else None)
@@ -106,8 +106,7 @@ def run_rows(config: Config, rows: Sequence[str]) -> None:
         write_row(row_folder(config, row), row, RowRecord(row, reason, {}), {})
     if not methods:
         return
-    lpips = or_exit(lambda: lpips_of(config))
-    results = {}
+    lpips, results = lpips_of(config), {}
     for name in set_names(config):
         if here := rows_of_set(name, methods):
             test_set, settings = pipeline_set(config, name, here), dataclasses.replace(config.benchmark, methods=here)

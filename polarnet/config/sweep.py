@@ -23,7 +23,7 @@ SCORES += [("test", name) for name in ("mse", "psnr", "ssim", "lpips", "corr")]
 
 
 class SweepTable(Callback):
-    """Writes comparison.csv and comparison.png into the sweep's folder and prints the ranking (conf/config.yaml)."""
+    """Writes comparison.csv and comparison.png into the sweep's folder (conf/config.yaml)."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Collect the trials and write their table; a sweep of another entry point has no trials and gets no table.
@@ -47,7 +47,7 @@ class SweepTable(Callback):
 
             drawn = {row["point"]: (row["validation_mse"], row["validation_mse_std"] or 0.0) for row in ranked}
             (folder / "comparison.png").write_bytes(png(sweep_chart(drawn)))
-        print(f"\n{ranking(rows)}\nAll scores: {folder / 'comparison.csv'}")
+        print(f"scores by validation MSE: {folder / 'comparison.csv'}")
         if failed := sum(point["failure"] is not None for point in points):
             raise SystemExit(f"{failed} of {len(points)} points failed; the table has their reasons")
 
@@ -57,7 +57,7 @@ def why_unfinished(job: Path, record: Mapping[str, Any]) -> str | None:
     before = _read(job / FINISHED)
     if before is None:
         return "it has not finished"
-    change = first_difference(before, json.loads(json.dumps(record)), "")
+    change = first_difference(before, json.loads(json.dumps(record)))
     return change and f"{change[0]} was {change[1]}, is {change[2]}"
 
 
@@ -114,20 +114,6 @@ def sweep_rows(points: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         row["failures"] = "; ".join(f"seed {one['seed']} failed: {one['failure']}" for one in failed)
         rows.append(row)
     return sorted(rows, key=lambda row: float("inf") if row["validation_mse"] is None else row["validation_mse"])
-
-
-def ranking(rows: Sequence[Mapping[str, Any]]) -> str:
-    """`sweep_rows` as lines: validation and test MSE, seeds, the point, and failures."""
-    lines = [f"{'validation MSE':>19}  {'test MSE':>19}  seeds   point"]
-    for row in rows:
-        validation, test = (_printed(row[f"{split}_mse"], row[f"{split}_mse_std"]) for split in ("validation", "test"))
-        lines.append(f"{validation:>19}  {test:>19}  {row['seeds']:<6}  {row['point']}")
-        lines += [f"    {row['failures']}"] if row["failures"] else []
-    return "\n".join(lines)
-
-
-def _printed(mean: float | None, std: float | None) -> str:
-    return "-" if mean is None else f"{mean:.4f}" + ("" if std is None else f" ± {std:.4f}")
 
 
 def _read(path: Path) -> Any:

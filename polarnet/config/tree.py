@@ -34,7 +34,6 @@ from polarnet.simulation.rotating import RotatingConfig
 from polarnet.simulation.sets import Recipe, SetsConfig
 from polarnet.simulation.variation import VariationConfig
 from polarnet.storage.parts import StorageConfig
-from polarnet.terminal.environment import INTERRUPTED, STOPPED
 from polarnet.training.baselines import BASELINES
 from polarnet.training.engine.loop import LoopConfig, TrainConfig
 from polarnet.training.engine.losses import LossConfig
@@ -164,22 +163,15 @@ class Config:
         """ValueError for a DoFP sensor of odd size, a crop larger than a channel, and images too small for LPIPS."""
         size = self.synthesize.sensor_height, self.synthesize.sensor_width
         channel = list(grid(self.polarizers.layout, *size)[:2])
-        crops = {"train": self.train.crop}
-        crops |= {f"baselines.{name}": self.baseline_config(name).crop for name in self.baselines.trained}
-        for training, crop in crops.items():
+        crops = {f"baselines.{name}": self.baseline_config(name).crop for name in self.baselines.trained}
+        for training, crop in {"train": self.train.crop, **crops}.items():
             if crop is not None and (crop[0] > channel[0] or crop[1] > channel[1]):
                 raise ValueError(
                     f"{training}.crop: expected at most a channel of section synthesize's sensor, {channel}, got {crop}"
                 )
-        compared = {
-            key: (self.lpips.backbone, crops.get(key.rpartition(".")[0], self.train.crop) or channel)
-            for key, weight in self.lpips_losses.items()
-            if weight > 0
-        }
-        if self.benchmark.lpips:
-            compared["benchmark.lpips"] = (self.benchmark.lpips_backbone, channel)
-        for key, (backbone, image) in compared.items():
-            side = BACKBONES[backbone].min_side
+        crops |= {"loss": self.train.crop, "benchmark": None}
+        for key, backbone in self.lpips_backbones.items():
+            image, side = crops[key.rpartition(".")[0]] or channel, BACKBONES[backbone].min_side
             if min(image) < side:
                 raise ValueError(f"{key}: LPIPS ({backbone}) needs images of {side} pixels a side, got {image}")
 
@@ -237,13 +229,15 @@ class Config:
         return path / BEST if trained or path.is_dir() else path
 
     @property
-    def lpips_losses(self) -> dict[str, float]:
-        """Weights of LPIPS in the losses of all trainings, by key."""
-        return {"loss.lpips": self.loss.lpips} | {
+    def lpips_backbones(self) -> dict[str, str]:
+        """Backbone of LPIPS by the key that asks for it: weights in the losses of all trainings, and the tables."""
+        weights = {"loss.lpips": self.loss.lpips} | {
             f"baselines.{name}.{key}": getattr(getattr(self.baselines, name), key)
             for name in self.baselines.trained
             for key in BASELINES[name].lpips
         }
+        backbones = {key: self.lpips.backbone for key, weight in weights.items() if weight > 0}
+        return backbones | ({"benchmark.lpips": self.benchmark.lpips_backbone} if self.benchmark.lpips else {})
 
     @property
     def network_config(self) -> NetworkConfig:
@@ -301,8 +295,7 @@ def hydra_stage(main: Stage) -> Callable[[], None]:
         or_exit(run.check_inputs)
         configure(config.runtime, config.seed)
         or_refuse(lambda: main(config), f"stage {script}")
-        if os.environ.get("RANK", "0") == "0":  # the first process of a training that several share
-            run.write_origins()
+        run.write_origins()
 
     return hydra_command(checked)
 
@@ -320,16 +313,7 @@ def hydra_command(main: Callable[[DictConfig], None]) -> Callable[[], None]:
         overrides = [word for word in sys.argv[1:] if "=" in word and not word.startswith("-")]
         or_exit(lambda: check_overrides(Config, root, overrides))
         logging.captureWarnings(True)
-        try:
-            run()
-        except PermissionError as error:
-            raise SystemExit(
-                f"{error.filename}: this folder cannot be written; give hydra.run.dir=FOLDER for the logs, "
-                "paths.data and paths.resume for the results"
-            ) from None
-        except KeyboardInterrupt:
-            print(f"stages.{_file_of(main).stem}: {STOPPED}", file=sys.stderr)
-            raise SystemExit(INTERRUPTED) from None
+        run()
 
     return command_line
 
@@ -356,17 +340,13 @@ def _file_of(main: Callable[..., None]) -> Path:
 
 def check_lpips(config: Config) -> None:
     """ValueError, with the keys that request LPIPS and the overrides that turn it off, if its weights are missing."""
-    asking = {key: (config.lpips.backbone, "0") for key, weight in config.lpips_losses.items() if weight > 0}
-    if config.benchmark.lpips:
-        asking["benchmark.lpips"] = (config.benchmark.lpips_backbone, "false")
-    for backbone in BACKBONES:
-        keys = {key: off for key, (wanted, off) in asking.items() if wanted == backbone}
+    for backbone in dict.fromkeys(config.lpips_backbones.values()):
+        keys = [key for key, asked in config.lpips_backbones.items() if asked == backbone]
         try:
             installed_version(backbone)
         except ValueError as error:
-            if keys:
-                without = " ".join(f"{key}={off}" for key, off in keys.items())
-                raise ValueError(f"{', '.join(keys)}: {error}; to go without: {without}") from None
+            without = " ".join(f"{key}={'false' if key == 'benchmark.lpips' else 0}" for key in keys)
+            raise ValueError(f"{', '.join(keys)}: {error}; to go without: {without}") from None
 
 
 def or_exit(check: Callable[[], T]) -> T:

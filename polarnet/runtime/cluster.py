@@ -121,8 +121,7 @@ def _interrupts_held() -> Iterator[None]:
 
 def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], address: str, bar: Bar) -> list[Result]:
     try:
-        from distributed import Client
-        from distributed import as_completed as dask_as_completed
+        from distributed import Client, as_completed
     except ImportError:
         raise RuntimeError(
             f"cluster.address needs Dask on this machine and on the workers: {installation('cluster')}"
@@ -130,11 +129,10 @@ def _over_dask(function: Callable[[Item], Result], items: Sequence[Item], addres
     with Client(address, timeout="30s") as client:
         one_by_one = functools.partial(on_one_thread, function)  # Dask runs several tasks of one worker side by side
         futures = client.map(one_by_one, items, retries=ATTEMPTS - 1, pure=False)
-        order: dict[Any, int] = {future.key: i for i, future in enumerate(futures)}
-        results: dict[int, Result] = {}
-        for future, result in dask_as_completed(futures, with_results=True):
-            if future.cancelled():  # its result is then an exception, which Dask does not raise
+        results = {}
+        for future in as_completed(futures):
+            if future.cancelled():
                 raise RuntimeError(f"{address}: the Dask scheduler has ended; start it and run the same command again")
-            results[order[future.key]] = result
+            results[future.key] = future.result()
             bar.update()
-    return [results[i] for i in range(len(items))]
+        return [results[future.key] for future in futures]

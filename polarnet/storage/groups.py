@@ -72,7 +72,7 @@ class GrowingColumns:
     def __init__(self, path: Path, chunk: int, sharded: bool, conventions: Mapping[str, str] = MappingProxyType({})):
         """`chunk` is the number of rows that are compressed together; `conventions` explain the columns to readers."""
         self.path = path
-        self._chunk, self._sharded, self._conventions = chunk, sharded, conventions
+        self.chunk, self._sharded, self._conventions = chunk, sharded, conventions
         self._group: zarr.Group | None = None
         self._arrays: dict[str, zarr.Array] = {}
         self._waiting: dict[str, list[np.ndarray]] = {}
@@ -84,7 +84,7 @@ class GrowingColumns:
             self._waiting.setdefault(name, []).append(values)
         self._rows += len(next(iter(rows.values())))
         row_bytes = sum(values.itemsize * int(np.prod(values.shape[1:])) for values in rows.values())
-        block = self._chunk * (max(1, SHARD_BYTES // (row_bytes * self._chunk)) if self._sharded else 1)
+        block = self.chunk * (max(1, SHARD_BYTES // (row_bytes * self.chunk)) if self._sharded else 1)
         while self._rows >= block:
             self._write(block)
 
@@ -119,8 +119,8 @@ class GrowingColumns:
         return group.create_array(
             name,
             shape=(0, *shape),
-            chunks=(self._chunk, *shape),
-            shards=(-(-max(rows, 1) // self._chunk) * self._chunk, *shape) if self._sharded else None,
+            chunks=(self.chunk, *shape),
+            shards=(-(-max(rows, 1) // self.chunk) * self.chunk, *shape) if self._sharded else None,
             dtype=values.dtype,
             fill_value=0,
             compressors=[zstd if self._sharded else lz4, Crc32cCodec()],

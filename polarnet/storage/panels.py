@@ -4,7 +4,7 @@ A film is for a page to play, so it holds bytes: fractions, angles and signed ev
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,10 +51,9 @@ class Panel:
 MAPS = ("events", "s0", "film_t_us", "film_events", "film_s0")
 
 
-def write_panel(folder: Path, panel: Panel, rows: Sequence[str] | None = None) -> None:
-    """Write the panel as SEQUENCE.npz, with the predictions of `rows` (None: of all)."""
-    names = [*panel.predictions] if rows is None else [*rows]
-    shown = [panel.truth, *(panel.predictions[name] for name in names)]
+def write_panel(folder: Path, panel: Panel) -> None:
+    """Write the panel as SEQUENCE.npz."""
+    shown = [panel.truth, *panel.predictions.values()]
     arrays: dict[str, Any] = {}
     for name, maps in zip(Shown._fields, zip(*shown, strict=True), strict=True):
         arrays[name] = torch.stack([one for one in maps if one is not None]).numpy()
@@ -62,7 +61,7 @@ def write_panel(folder: Path, panel: Panel, rows: Sequence[str] | None = None) -
         folder / f"{panel.sequence}.npz",
         window=np.int64(panel.window),
         t_us=np.int64(panel.t_us),
-        rows=np.array(names, dtype=np.str_),
+        rows=np.array([*panel.predictions], dtype=np.str_),
         with_aolp=np.array([one.aolp is not None for one in shown]),
         **arrays,
         **{name: getattr(panel, name).numpy() for name in MAPS},

@@ -15,7 +15,6 @@ has its zarr.json, which is copied last. The same sequences give the same bytes,
 """
 
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import json
@@ -29,7 +28,7 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
 import fsspec
 import numpy as np
@@ -73,6 +72,8 @@ class Store:
 
     FORMAT: ClassVar[str]
     VERSION: ClassVar[int]
+    chunk: ClassVar[int]
+    """Rows that are compressed together, the smallest unit of reading."""
     sequences: list[str]
     sequences_per_part: PositiveInt
     attributes: dict[str, Any]
@@ -81,11 +82,9 @@ class Store:
     """Digest of each part of a finished store, so that a part of another store is refused."""
 
     def __init__(self, path: str, header: Header):
-        known, kind = {"digests": {}, **header}, cast("Any", type(self))
-        keys = _header_class(kind)
-        names = [field.name for field in dataclasses.fields(keys) if field.name in known]
-        checked = keys(**{name: known[name] for name in names})
-        vars(self).update({name: getattr(checked, name) for name in names})
+        kind: Any = type(self)
+        known, keys = {"digests": {}, **header}, _header_class(kind)
+        vars(self).update(vars(keys(**{name: known[name] for name in keys.__dataclass_fields__ if name in known})))
         self.path, self.header = path, header
         _check_names(self.sequences)
         starts = range(0, len(self.sequences), self.sequences_per_part)
@@ -101,11 +100,6 @@ class Store:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.header)
-
-    @property
-    def chunk(self) -> int:
-        """Rows that are compressed together, the smallest unit of reading."""
-        raise NotImplementedError
 
     @classmethod
     def create_parts(
@@ -135,8 +129,11 @@ class Store:
         if not is_url(path):
             store._claim.enter_context(claimed(Path(path)))
         begun = {**header, "code": code_digest()}
-        if (known := _header_at(store.path)) != begun:
-            if known is not None and is_url(path):
+        known: Header = {}
+        with contextlib.suppress(FileNotFoundError, ValueError):  # nothing there, or damaged
+            known = dict(open_group(store.path).attrs)
+        if known != begun:
+            if known and is_url(path):
                 raise ValueError(f"{path}: expected nothing there, or this store unfinished, got another; delete it")
             shutil.rmtree(store.path, ignore_errors=True)
         with named_shortage(Path(store.path)):
@@ -210,7 +207,7 @@ class Store:
         if begun is None or sequence != expected:
             raise ValueError(f"{self.path}: {part} takes its sequences in order, expected {expected}, got {sequence}")
         with named_shortage(Path(self.path)):
-            begun.append(sequence, columns, record)
+            begun.add_sequence(sequence, columns, record)
             begun.maps |= {f"{name}/{sequence}": values for name, values in maps.items()}
             size = self._unfinished.pop(part).finish() if sequence == names[-1] else 0
         if size and not is_url(self.path):
@@ -326,54 +323,51 @@ class Store:
         return self._opened[key]
 
 
-class _Part:
+class _Part(GrowingColumns):
     """A part that one process writes, under a temporary name until it is complete."""
 
-    def __init__(self, path: str, chunk: int):
-        self.path = path
+    def __init__(self, url: str, chunk: int):
+        folder, name = (tempfile.gettempdir() if is_url(url) else os.path.dirname(url)), os.path.basename(url)
+        super().__init__(Path(folder, f"{name}.{uuid.uuid4().hex}.tmp"), chunk, sharded=True)
+        self.url, self.stop = url, 0
         self.records: dict[str, Header] = {}
         self.maps: dict[str, np.ndarray] = {}
-        self._chunk = chunk
-        folder = tempfile.gettempdir() if is_url(path) else os.path.dirname(path)
-        self._temporary = Path(folder, f"{os.path.basename(path)}.{uuid.uuid4().hex}.tmp")
-        self._columns = GrowingColumns(self._temporary, chunk, sharded=True)
-        self._stop = 0
 
-    def append(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
+    def add_sequence(self, sequence: str, columns: Mapping[str, np.ndarray], record: Mapping[str, Any]) -> None:
         """Add the rows of a sequence, filled up to whole chunks with 0, and hold its record until `finish`."""
         (rows,) = {len(values) for values in columns.values()}
-        padding = -rows % self._chunk
-        self._columns.append(columns)
-        self._columns.append({name: np.zeros((padding, *one.shape[1:]), one.dtype) for name, one in columns.items()})
-        self.records[sequence] = {**record, "rows": [self._stop, self._stop + rows]}
-        self._stop += rows + padding
+        padding = -rows % self.chunk
+        self.append(columns)
+        self.append({name: np.zeros((padding, *one.shape[1:]), one.dtype) for name, one in columns.items()})
+        self.records[sequence] = {**record, "rows": [self.stop, self.stop + rows]}
+        self.stop += rows + padding
 
     def finish(self) -> int:
         """Write the metadata, give the part its name and return its size in bytes.
 
         Another process may have given the name to the same bytes.
         """
-        self._columns.flush()
-        group = zarr.open_group(self._temporary, mode="r+")
+        self.flush()
+        group = zarr.open_group(self.path, mode="r+")
         for name, values in self.maps.items():
             group.create_array(name, data=values, chunks=values.shape, compressors=[ZstdCodec(), Crc32cCodec()])
-        files = sorted(path for path in self._temporary.rglob("*") if path.is_file())
-        digests = {path.relative_to(self._temporary).as_posix(): sha256(path) for path in files}
+        files = sorted(path for path in self.path.rglob("*") if path.is_file())
+        digests = {path.relative_to(self.path).as_posix(): sha256(path) for path in files}
         del digests[METADATA]
         group.attrs.put({"sequences": self.records, "sha256": digests})
         size = sum(path.stat().st_size for path in files)
-        if is_url(self.path):
-            bucket, name = fsspec.url_to_fs(self.path)
+        if is_url(self.url):
+            bucket, name = fsspec.url_to_fs(self.url)
             for file in [*digests, METADATA]:
                 bucket.makedirs(os.path.dirname(f"{name}/{file}"), exist_ok=True)
-                bucket.put_file(str(self._temporary / file), f"{name}/{file}")
+                bucket.put_file(str(self.path / file), f"{name}/{file}")
         else:
             try:
-                os.rename(self._temporary, self.path)
+                os.rename(self.path, self.url)
             except OSError:
-                if not Path(self.path, METADATA).exists():
+                if not Path(self.url, METADATA).exists():
                     raise
-        shutil.rmtree(self._temporary, ignore_errors=True)
+        shutil.rmtree(self.path, ignore_errors=True)
         return size
 
 
@@ -416,12 +410,3 @@ def _checksum(header: Header) -> str:
     """SHA-256 of a finished header without its checksum."""
     plain = {key: value for key, value in header.items() if key != "checksum"}
     return sha256(json.dumps(plain, sort_keys=True).encode())
-
-
-def _header_at(path: str) -> Header | None:
-    """The header of a store; None if there is no store."""
-    try:
-        with fsspec.open(f"{path}/{METADATA}") as file:
-            return json.load(file)["attributes"]
-    except (OSError, ValueError, KeyError):
-        return None

@@ -82,7 +82,7 @@ class ProgressBar(tqdm):
         """Arguments of tqdm."""
         self.disable = False
         self.terminal = sys.stderr.isatty()
-        in_log = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S, "miniters": 0}
+        in_log = {"delay": LINE_S, "mininterval": LINE_S, "maxinterval": LINE_S, "miniters": 0, "position": 0}
         pace = {"delay": PATIENCE_S} if self.terminal else in_log
         super().__init__(*arguments, **{**pace, **options})
 

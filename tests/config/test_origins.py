@@ -95,7 +95,7 @@ def test_an_origin_holds_the_values_of_an_artefact_and_its_inputs_and_others_are
     origin = read_origin(tmp_path / "data" / "events.zarr")
     assert {"ingest", "synthesize", "emulate", "polarizers", "readout", "seed"} <= set(origin.values)
     assert not {"loss", "train", "runtime", "paths"} & set(origin.values)
-    assert origin.inputs == {"data/scenes.zarr": digest([tmp_path / "data" / "scenes.zarr"])}
+    assert origin.inputs == {"data/scenes.zarr": digest(tmp_path / "data" / "scenes.zarr")}
 
 
 def test_an_artefact_in_anothers_place_or_of_another_run_is_refused(run, tmp_path):
@@ -128,12 +128,12 @@ def test_an_origin_with_one_other_digit_is_refused(run, tmp_path):
 
 def test_a_digest_changes_with_a_header_a_name_and_a_size(tmp_path):
     (tmp_path / "a").write_text("1")
-    first = digest([tmp_path])
-    assert first == digest([tmp_path])
+    first = digest(tmp_path)
+    assert first == digest(tmp_path)
     (tmp_path / "a").write_text("2")
-    second = digest([tmp_path])
+    second = digest(tmp_path)
     (tmp_path / "b").touch()
-    assert len({first, second, digest([tmp_path])}) == 3
+    assert len({first, second, digest(tmp_path)}) == 3
 
 
 def scored_rows(rows):
