@@ -1,4 +1,4 @@
-"""Base class of recurrent networks that others published, and the layers of FireNet, which E2P shares."""
+"""Base class of recurrent networks that others published, and the layers of FireNet, which E2P and E2VID share."""
 
 import os
 import pickle
@@ -107,13 +107,15 @@ class ConvGRU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """FireNet's residual block relu(x + conv(relu(conv(x))))."""
+    """FireNet's residual block relu(x + conv(relu(conv(x)))); E2VID's has batch normalisation after each conv."""
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, normalised: bool = False):
         super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1, bias=not normalised)
+        self.bn1 = nn.BatchNorm2d(channels) if normalised else nn.Identity()
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=not normalised)
+        self.bn2 = nn.BatchNorm2d(channels) if normalised else nn.Identity()
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return a tensor of the same shape."""
-        return self.conv2(self.conv1(x).relu_()).add_(x).relu_()
+        return self.bn2(self.conv2(self.bn1(self.conv1(x)).relu_())).add_(x).relu_()

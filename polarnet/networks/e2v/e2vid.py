@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.published import PublishedNetwork
+from polarnet.networks.base.published import PublishedNetwork, ResidualBlock
 
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
@@ -42,7 +42,7 @@ class E2vid(PublishedNetwork):
             Recurrent(convolution(inputs, outputs, 5, stride=2, normalised=True, relu=True), outputs)
             for inputs, outputs in steps
         )
-        self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1]) for _ in range(RESIDUAL_BLOCKS))
+        self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1], normalised=True) for _ in range(RESIDUAL_BLOCKS))
         self.decoders = nn.ModuleList(decoder(inputs, outputs) for outputs, inputs in reversed(steps))
         self.pred = convolution(HEAD_CHANNELS, 1, 1, normalised=True)
 
@@ -125,21 +125,6 @@ class ConvLstm(nn.Module):
         i, f, o, g = self.Gates(torch.cat([x, output.to(x.dtype)], dim=1)).chunk(4, dim=1)
         memory = torch.sigmoid(f) * memory.to(f.dtype) + torch.sigmoid(i) * torch.tanh(g)
         return torch.sigmoid(o) * torch.tanh(memory), memory
-
-
-class ResidualBlock(nn.Module):
-    """Residual block relu(x + bn(conv(relu(bn(conv(x))))))."""
-
-    def __init__(self, channels: int):
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn1 = nn.BatchNorm2d(channels)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(channels)
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return a tensor of the same shape."""
-        return F.relu(x + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
 
 
 def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:
