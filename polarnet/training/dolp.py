@@ -46,10 +46,6 @@ def dolp_task(
             maps = torch.cat([maps, prediction.stokes], dim=2)
         return maps, state
 
-    def unroll_with_features(inputs: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
-        prediction, features, state = network.unroll_with_features(inputs, state)
-        return prediction.dolp, features, state
-
     return Task(
         network=network,
         encode=encode,
@@ -67,7 +63,6 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        unroll_with_features=unroll_with_features if build.predicts_stokes else None,
         scene_dolp=config.scene_dolp,
     )
 

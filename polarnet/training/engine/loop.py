@@ -106,7 +106,7 @@ def train(
         means = train_epoch(task, optimizer, visits, config, device, workers)
         scores = validate(task, split.val, config, device, workers)
         recorder.end_epoch(network, optimizer, means, scores)
-    if task.unroll_with_features is not None:
+    if hasattr(network, "expect"):
         network.load_state_dict(recorder.best)
         recorder.calibrated(network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers))
     recorder.finish()
@@ -269,11 +269,10 @@ def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
     """Features and squared errors of one 2x2-pixel block in `every` along each axis, and the state after the run."""
-    assert task.unroll_with_features is not None
     windows, frames, valid = run
     with autocast(precision, windows.device):
-        predicted, features, state = task.unroll_with_features(windows, state)
-    errors = (predicted.clamp(0, 1) - task.scored(frames)).square()
+        predicted, features, state = task.network.unroll_with_features(windows, state)  # type: ignore[operator]
+    errors = (predicted.dolp.clamp(0, 1) - task.scored(frames)).square()
     known = torch.ones_like(errors) if valid is None else valid.to(errors)
     squared, share_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
     height, width = (every * size for size in squared.shape[-2:])

@@ -28,6 +28,8 @@ class Task:
     """The network-specific parts of a training."""
 
     network: nn.Module
+    """One with a method `expect(weight, bias)` predicts DoLP, and its error from the features that its method
+    `unroll_with_features` returns."""
     encode: Encode
     """Function that turns one channel's events in a window into the network's input."""
     streams: Callable[
@@ -45,11 +47,6 @@ class Task:
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Function that picks the map to score from predicted or true maps; its validation MSE selects the best epoch."""
-    unroll_with_features: (
-        Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
-    ) = None
-    """Same as `unroll`, but with the `scored` map alone and, at half resolution, features of its expected error. None:
-    the network expects no error. A network with this function has a method `expect(weight, bias)`."""
     scene_dolp: Sequence[float] | None = None
     """Median and 90th percentile of the mean DoLP of real scenes, for which the expected errors are fitted, too. None:
     they are fitted to the training pictures alone."""
