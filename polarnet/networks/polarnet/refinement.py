@@ -126,7 +126,7 @@ def compiled_event_moves(
     for n, pixels in enumerate(y.permute(0, 2, 3, 1)):
         gains = torch.addmm(layer.bias[:, None], layer.weight.flatten(1), pixels.flatten(0, 1).T).float()
         for gain, near in zip(gains.unflatten(1, pixels.shape[:2]).chunk(len(sums)), sums, strict=True):
-            kernels.add_moves(near.flatten(0, 1)[n].numpy(), gain.numpy(), moves[n].numpy())
+            kernels.add_moves(near.flatten(0, 1)[n], gain, moves[n])
     return moves
 
 

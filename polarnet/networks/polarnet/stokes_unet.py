@@ -312,23 +312,15 @@ class StokesUNet(nn.Module):
         moments = polarity.new_empty(t * b, memories, redundancy.MOMENTS, height // 4, width // 4)
         half = torch.is_autocast_enabled("cpu")
         images = torch.empty(t * b, 4 * memories + 1, height, width, dtype=torch.uint16 if half else torch.float32)
-        noise = self.moments.factors().numpy()
+        noise = self.moments.factors()
         before = torch.zeros_like(steps[0]) if before is None else before
         polarity, count = polarity.contiguous(), count.contiguous()
         for n in range(t * b):
             k, stream = divmod(n, b)
-            kernels.sums_and_moments(
-                (before if k == 0 else steps[k - 1])[stream].numpy(),
-                polarity[k, stream].numpy(),
-                count[k, stream].numpy(),
-                scale[n].numpy()[0, 0, 0],
-                self.memories.numpy(),
-                noise,
-                half,
-                steps[k, stream].numpy(),
-                moments[n].numpy(),
-                images[n].numpy(),
-            )
+            sums = (before if k == 0 else steps[k - 1])[stream]
+            window = (polarity[k, stream], count[k, stream], scale[n].numpy()[0, 0, 0])
+            outputs = (steps[k, stream], moments[n], images[n])
+            kernels.sums_and_moments(sums, *window, self.memories, noise, half, *outputs)
         return steps, moments, images.view(torch.bfloat16) if half else images
 
     def _candidates(
