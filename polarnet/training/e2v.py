@@ -8,7 +8,7 @@ from torch import Tensor
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.lpips import Lpips
-from polarnet.networks.e2v import ARCHITECTURES
+from polarnet.networks.e2v.network import ARCHITECTURES
 from polarnet.runtime.sections import one_of, section
 from polarnet.training.engine.loop import LoopConfig
 from polarnet.training.engine.losses import FrameLoss

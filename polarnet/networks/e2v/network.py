@@ -1,6 +1,8 @@
-"""E2VID: intensity from events, with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
+"""Networks of the E2V baseline, from events to intensity: E2VID and FireNet.
 
-`E2vid.load` reads the authors' "lightweight" checkpoint, E2VID_lightweight.pth.tar.
+E2VID has 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021), FireNet 37,777 (Scheerlinck et al., WACV
+2020). `E2vid.load` reads the authors' "lightweight" checkpoint, E2VID_lightweight.pth.tar; `FireNet.load` those of
+FireNet and of FireNet+ (Stoffregen et al., ECCV 2020).
 """
 
 import itertools
@@ -14,13 +16,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.published import PublishedNetwork, ResidualBlock
+from polarnet.networks.base.published import ConvGRU, PublishedNetwork, ResidualBlock
 
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
 RESIDUAL_BLOCKS = 2
 Padding = Literal["zeros", "reflect"]
 SIZE_MULTIPLE = 2 ** len(ENCODER_CHANNELS)  # each encoder halves height and width
+FIRENET_CHANNELS = 16
+MIDDLE_INTENSITY = 0.25  # initial bias of FireNet's output: a polarizer passes half of S0 = 0.5
+FIRENET_NAMES = {
+    "head.conv.conv2d": "head.conv2d",
+    "head.recurrent_block": "G1",
+    "resblocks.0.conv": "R1",
+    "resblocks.0.recurrent_block": "G2",
+    "resblocks.1": "R2",
+}
+"""Our names of FireNet's layers by those of its file, which are those of E2VID's code."""
 
 
 class E2vid(PublishedNetwork):
@@ -69,6 +81,46 @@ class E2vid(PublishedNetwork):
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Remove the authors' prefix."""
         return {name.removeprefix("unetrecurrent."): tensor for name, tensor in tensors.items()}
+
+
+class FireNet(PublishedNetwork):
+    """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv at full resolution, without output activation.
+
+    The input is a voxel grid of one channel, normalised by `normalise_nonzero` for FireNet, unnormalised for FireNet+.
+    """
+
+    label = "FireNet"
+    first_layer = "head.conv2d.weight"
+
+    def __init__(self, bins: int):
+        super().__init__(bins)
+        self.head = convolution(bins, FIRENET_CHANNELS, 3, relu=True)
+        self.G1 = ConvGRU(FIRENET_CHANNELS)
+        self.R1 = ResidualBlock(FIRENET_CHANNELS)
+        self.G2 = ConvGRU(FIRENET_CHANNELS)
+        self.R2 = ResidualBlock(FIRENET_CHANNELS)
+        self.pred = convolution(FIRENET_CHANNELS, 1, 1)
+        nn.init.constant_(self.pred.get_parameter("conv2d.bias"), MIDDLE_INTENSITY)
+
+    def forward(
+        self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
+        """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
+        before1, before2 = state or (None, None)
+        after1 = self.G1(self.head(voxels.contiguous(memory_format=torch.channels_last)), before1)
+        after2 = self.G2(self.R1(after1), before2)
+        intensity = self.pred(self.R2(after2))
+        return intensity[:, 0].float(), [after1, after2]
+
+    @classmethod
+    def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Rename FireNet's tensors, named after the blocks of E2VID's code; FireNet+ uses our names."""
+        renamed = {}
+        for name, tensor in tensors.items():
+            name = name.removeprefix("net.")
+            theirs = next((theirs for theirs in FIRENET_NAMES if name.startswith(theirs)), "")
+            renamed[FIRENET_NAMES.get(theirs, "") + name.removeprefix(theirs)] = tensor
+        return renamed
 
 
 def convolution(
@@ -132,3 +184,7 @@ def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor,
     rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
     top, left = math.ceil(rows / 2), math.ceil(columns / 2)
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
+
+
+ARCHITECTURES: dict[str, type[FireNet] | type[E2vid]] = {"firenet": FireNet, "e2vid": E2vid}
+"""Networks by name: `baselines.e2v.arch` selects one, and its checkpoint names it."""
