@@ -21,15 +21,7 @@ from polarnet.training.engine.calibration import Scene, fitted, joined, weights_
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
 from polarnet.training.engine.recorder import Recorder
-from polarnet.training.engine.sequences import (
-    Batch,
-    ViewConfig,
-    Visits,
-    WindowDataset,
-    batches_of,
-    loaded_if_it_fits,
-    shuffled,
-)
+from polarnet.training.engine.sequences import Batch, ViewConfig, Visits, WindowDataset, batches_of, loaded_if_it_fits
 from polarnet.training.engine.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
@@ -117,7 +109,7 @@ def train_epoch(
 ) -> dict[str, float]:
     """Return means of the loss and its terms over the steps; FloatingPointError if a loss is infinite or NaN."""
     sums, steps, done = Counter[str](), 0, 0
-    order, title = shuffled(len(visits), visits.seed, visits.epoch), f"epoch {visits.epoch + 1}/{config.epochs}"
+    order, title = visits.order(), f"epoch {visits.epoch + 1}/{config.epochs}"
     with ProgressBar(total=len(order), desc=title, unit="visit") as bar:
         for batch in batches_of(visits, order, config.batch_size, workers):
             set_learning_rate(optimizer, config, (visits.epoch + done / len(order)) / config.epochs)

@@ -151,6 +151,11 @@ class Visits(Dataset[WindowSequence]):
     def __len__(self) -> int:
         return self.config.visits * len(self.sequences)
 
+    def order(self) -> list[int]:
+        """Return the random order of the visits."""
+        generator = generator_for(self.seed, "all sequences", f"order of epoch {self.epoch}")
+        return generator.permutation(len(self)).tolist()
+
     def __getitem__(self, index: int) -> WindowSequence:
         visit, number = divmod(index, len(self.sequences))
         sequence = self.sequences[number]
@@ -195,11 +200,6 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     valid = None if masks[0] is None else torch.stack(masks, dim=1)  # one store: masks for all or none
     inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
     return Batch(list(names), inputs, dolp, aolp, intensity, valid)
-
-
-def shuffled(count: int, seed: int, epoch: int) -> list[int]:
-    """Return a random order of `count` visits for an epoch."""
-    return generator_for(seed, "all sequences", f"order of epoch {epoch}").permutation(count).tolist()
 
 
 def batches_of(
