@@ -77,7 +77,7 @@ class Equaliser(nn.Module):
         weighted, sums, mismatches = [], [], []
         for now in events:
             totals = totals + now
-            mean = _near(torch.addcmul(totals, totals, change))
+            mean = enlarged(box_means(block_means(torch.addcmul(totals, totals, change), BLOCK), BLOCKS), BLOCK)
             some, some_mean = totals[..., ::SPARSE, ::SPARSE], mean[..., ::SPARSE, ::SPARSE]
             deviation = torch.minimum((some - some_mean).abs(), OUTLIER * (some_mean + 1))
             power = some_mean.square().mean((-1, -2), keepdim=True).clamp(min=MIN_POWER)
@@ -127,11 +127,6 @@ class Equaliser(nn.Module):
             mismatches.append(mismatch.mean())
         summary = polarity.new_tensor([sums, mismatches])[..., None]
         return Equalised(polarities, events, *summary), [totals, change]
-
-
-def _near(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    """Return means over the neighbourhood of each pixel."""
-    return enlarged(box_means(block_means(x, BLOCK), BLOCKS), BLOCK)
 
 
 class Scale(nn.Module):
