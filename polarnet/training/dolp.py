@@ -13,7 +13,7 @@ from polarnet.metrics.lpips import Lpips
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.training.engine.loop import TrainConfig
 from polarnet.training.engine.losses import LossConfig, PolarizationLoss
-from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import State, Task, initialised
 
 FITTED = "expected."  # tensors of the expected errors, which every training fits anew
@@ -67,7 +67,7 @@ def dolp_task(
     )
 
 
-def normalised_stokes(batch: Batch) -> Float[Tensor, "t b 3 h w"]:
+def normalised_stokes(batch: Windows) -> Float[Tensor, "t b 3 h w"]:
     """Stack the truth of a batch: DoLP, s1 = S1 / S0 and s2 = S2 / S0."""
     angle = 2 * batch.aolp
     return torch.stack([batch.dolp, batch.dolp * torch.cos(angle), batch.dolp * torch.sin(angle)], dim=2)

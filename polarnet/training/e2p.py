@@ -15,7 +15,7 @@ from polarnet.networks.e2p.network import BRANCHES, E2p, coded_aolp, interleaved
 from polarnet.runtime.sections import section
 from polarnet.training.engine.loop import LoopConfig
 from polarnet.training.engine.losses import FrameLoss
-from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import Baseline, Task, initialised
 
 
@@ -67,7 +67,7 @@ def e2p_task(config: E2pConfig, lpips: Lpips | None, seed: int) -> Task:
     def encode(events: Events, window_us: int) -> Tensor:
         return voxel_grid(events, config.bins)
 
-    def streams(batch: Batch) -> tuple[Tensor, Tensor, Tensor | None]:
+    def streams(batch: Windows) -> tuple[Tensor, Tensor, Tensor | None]:
         s0 = batch.intensity[:, :, 0] + batch.intensity[:, :, 2]
         truth = {"intensity": s0, "aolp": coded_aolp(batch.aolp), "dolp": batch.dolp}
         mosaic = interleaved(batch.inputs.unflatten(2, (4, config.bins)))

@@ -21,7 +21,7 @@ from polarnet.training.engine.calibration import Scene, fitted, joined, weights_
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
 from polarnet.training.engine.recorder import Recorder
-from polarnet.training.engine.sequences import Batch, ViewConfig, Visits, WindowDataset, batches_of, loaded_if_it_fits
+from polarnet.training.engine.sequences import ViewConfig, Visits, WindowDataset, Windows, batches_of, loaded_if_it_fits
 from polarnet.training.engine.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
@@ -128,7 +128,7 @@ def train_epoch(
 
 
 def train_batch(
-    task: Task, optimizer: Optimizer, batch: Batch, config: LoopConfig, device: torch.device
+    task: Task, optimizer: Optimizer, batch: Windows, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step."""
     state: State = None
@@ -149,10 +149,10 @@ def train_batch(
     return losses
 
 
-def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
+def runs_of(task: Task, batch: Windows, length: int, device: torch.device) -> Iterator[Run]:
     """Yield runs of `length` windows of a batch, on the device."""
     read = batch if task.wants_intensity else batch._replace(intensity=batch.intensity[:0])
-    there = Batch(read.names, *(None if field is None else field.to(device) for field in read[1:]))  # type: ignore
+    there = Windows(read.names, *(None if field is None else field.to(device) for field in read[1:]))  # type: ignore
     inputs, truth, valid = task.streams(there._replace(inputs=there.inputs.float()))
     windows, frames = inputs.split(length), truth.split(length)
     masks = [None] * len(frames) if valid is None else valid.split(length)
@@ -244,7 +244,7 @@ def calibrate(
     return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
 
 
-def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
+def sampled_sequence(task: Task, batch: Windows, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
     """Sampled errors of a batch's only sequence and of one frame without events, and the MSE without that frame."""
     every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
     samples: list[Scene] = []

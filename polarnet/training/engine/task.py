@@ -17,7 +17,7 @@ from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from polarnet.training.engine.losses import FrameLoss
-from polarnet.training.engine.sequences import Batch, WindowDataset
+from polarnet.training.engine.sequences import WindowDataset, Windows
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)
@@ -33,7 +33,7 @@ class Task:
     encode: Encode
     """Function that turns one channel's events in a window into the network's input."""
     streams: Callable[
-        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
+        [Windows], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
     ]
     """Function from a batch to the network's input, the truth, and the mask of known truth (None: all known)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
