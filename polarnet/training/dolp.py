@@ -12,7 +12,7 @@ from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.metrics.lpips import Lpips
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.training.engine.loop import TrainConfig
-from polarnet.training.engine.losses import LossConfig, PolarizationLoss
+from polarnet.training.engine.losses import LossConfig, polarization_loss
 from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import State, Task, initialised
 
@@ -51,7 +51,7 @@ def dolp_task(
         encode=encode,
         streams=lambda batch: (batch.inputs, normalised_stokes(batch), batch.valid),
         unroll=unroll,
-        loss=PolarizationLoss(loss, lpips, dolp_only=not build.predicts_stokes),
+        loss=polarization_loss(loss, lpips, dolp_only=not build.predicts_stokes),
         description={
             "network": name,
             "config": asdict(network_config),

@@ -11,7 +11,7 @@ from polarnet.metrics.lpips import Lpips
 from polarnet.networks.e2v.network import ARCHITECTURES
 from polarnet.runtime.sections import one_of, section
 from polarnet.training.engine.loop import LoopConfig
-from polarnet.training.engine.losses import FrameLoss
+from polarnet.training.engine.losses import Loss, frame_terms
 from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import Baseline, Task, initialised
 
@@ -49,7 +49,7 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
         encode=encode,
         streams=streams,
         unroll=network.unroll,
-        loss=FrameLoss({"mae": 1.0, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips),
+        loss=Loss(frame_terms({"mae": 1.0, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)),
         description={
             "network": config.arch,
             "config": {"bins": config.bins},

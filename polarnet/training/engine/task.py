@@ -16,7 +16,7 @@ from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.engine.losses import FrameLoss
+from polarnet.training.engine.losses import Loss
 from polarnet.training.engine.sequences import WindowDataset, Windows
 
 State = list[Tensor] | None
@@ -38,7 +38,7 @@ class Task:
     """Function from a batch to the network's input, the truth, and the mask of known truth (None: all known)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
     """Function from consecutive windows and a state to k predicted maps (or one, without the axis) and a state."""
-    loss: FrameLoss
+    loss: Loss
     description: Mapping[str, Any]
     """Metadata of the network and its input for checkpoints: at least "network", "config" and "in_channels"."""
     wants_intensity: bool = True
