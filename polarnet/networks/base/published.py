@@ -61,23 +61,14 @@ class PublishedNetwork(nn.Module):
         return dict(tensors)
 
 
-class StandIn:
-    """Empty replacement for an object of the authors' code in a file of which only the tensors are needed."""
-
-    def __init__(self, *arguments: Any):
-        pass
-
-    def __setstate__(self, state: Any) -> None:
-        pass
-
-
 def read_content(path: str | os.PathLike[str]) -> Any:
-    """Load a torch file, with `StandIn`s for objects of the authors' code; ValueError if torch cannot read it."""
+    """Load a torch file, with empty objects for those of the authors' code; ValueError if torch cannot read it."""
     try:
         unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except (ValueError, RuntimeError):  # files older than torch's zip format, which hold no such objects
         unknown = []
-    inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
+    ignoring = {"__init__": lambda self, *arguments: None, "__setstate__": lambda self, state: None}
+    inert: list[Any] = [(type(name.rpartition(".")[2], (), ignoring), name) for name in unknown]
     try:
         with torch.serialization.safe_globals(inert):
             return torch.load(path, map_location="cpu", weights_only=True)
