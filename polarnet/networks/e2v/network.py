@@ -7,6 +7,7 @@ FireNet and of FireNet+ (Stoffregen et al., ECCV 2020).
 
 import itertools
 import math
+import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -115,12 +116,9 @@ class FireNet(PublishedNetwork):
     @classmethod
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Rename FireNet's tensors, named after the blocks of E2VID's code; FireNet+ uses our names."""
-        renamed = {}
-        for name, tensor in tensors.items():
-            name = name.removeprefix("net.")
-            theirs = next((theirs for theirs in FIRENET_NAMES if name.startswith(theirs)), "")
-            renamed[FIRENET_NAMES.get(theirs, "") + name.removeprefix(theirs)] = tensor
-        return renamed
+        theirs = re.compile("|".join(map(re.escape, FIRENET_NAMES)))
+        plain = {name.removeprefix("net."): tensor for name, tensor in tensors.items()}
+        return {theirs.sub(lambda match: FIRENET_NAMES[match[0]], name): tensor for name, tensor in plain.items()}
 
 
 def convolution(

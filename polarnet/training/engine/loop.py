@@ -90,10 +90,10 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     recorder.resume(network, optimizer)
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
-    trained = len(recorder.history) == config.epochs
-    loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
+    epochs = range(len(recorder.history), config.epochs)
+    loaded = loaded_if_it_fits(split.train, task.wants_intensity, helpers) if epochs else None
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
-    for epoch in range(len(recorder.history), config.epochs):
+    for epoch in epochs:
         visits = Visits(sequences, config, seed, epoch)
         means = train_epoch(task, optimizer, visits, config, device, workers)
         scores = validate(task, split.val, config, device, workers)
