@@ -278,12 +278,6 @@ class StokesUNet(nn.Module):
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         return prediction, self._enlarged(features), recurrent
 
-    @torch.no_grad()
-    def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """Set the log-variance to weight @ features + bias."""
-        self.expected.weight.copy_(weight)
-        self.expected.bias.fill_(bias)
-
     def _event_sums(
         self,
         polarity: Float[Tensor, "t b 4 h w"],

@@ -98,7 +98,7 @@ def train(
         means = train_epoch(task, optimizer, visits, config, device, workers)
         scores = validate(task, split.val, config, device, workers)
         recorder.end_epoch(network, optimizer, means, scores)
-    if hasattr(network, "expect"):
+    if hasattr(network, "expected"):
         network.load_state_dict(recorder.best)
         recorder.calibrated(network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers))
     recorder.finish()
@@ -239,7 +239,7 @@ def calibrate(
     for name, scene in scenes.items():
         of_pictures.setdefault(dataset.frames.original_of(name), []).append(scene)
     fit = fitted([joined(of_picture) for of_picture in of_pictures.values()])
-    task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
+    task.network.get_submodule("expected").load_state_dict({"weight": fit.weight, "bias": torch.tensor(fit.bias)})
     task.network.train()
     return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
 

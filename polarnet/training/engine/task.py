@@ -28,8 +28,7 @@ class Task:
     """The network-specific parts of a training."""
 
     network: nn.Module
-    """One with a method `expect(weight, bias)` predicts DoLP, and its error from the features that its method
-    `unroll_with_features` returns."""
+    """One with a module `expected` predicts DoLP, and its error from features (`unroll_with_features`)."""
     encode: Encode
     """Function that turns one channel's events in a window into the network's input."""
     streams: Callable[
