@@ -71,4 +71,4 @@ def e2p_task(config: E2pConfig, lpips: Lpips | None, seed: int) -> Task:
     )
 
 
-BASELINE = Baseline("e2p", E2pConfig, e2p_task, lpips=("lpips", "intensity_lpips"))
+BASELINE = Baseline(E2pConfig, e2p_task, lpips=("lpips", "intensity_lpips"))

@@ -59,4 +59,4 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
     )
 
 
-BASELINE = Baseline("e2v", E2vConfig, e2v_task, lpips=("lpips",))
+BASELINE = Baseline(E2vConfig, e2v_task, lpips=("lpips",))

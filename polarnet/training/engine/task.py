@@ -55,10 +55,8 @@ class Task:
 class Baseline:
     """Record of a baseline that the pipeline trains; its module in polarnet.training holds it as `BASELINE`."""
 
-    name: str
-    """Section of `baselines` in params.yaml, and folder below data/train."""
     config: type
-    """Class of that section."""
+    """Class of its section of `baselines` in params.yaml."""
     task: Callable[[Any, Lpips | None, int], Task]
     """Section, LPIPS and seed -> the task of a new network."""
     lpips: tuple[str, ...]
