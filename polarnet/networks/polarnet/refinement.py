@@ -130,11 +130,6 @@ def compiled_event_moves(
     return moves
 
 
-def moved_by_events(stokes: Float[Tensor, "n 2 h w"], moves: Float[Tensor, "n 2 h w"]) -> Float[Tensor, "n 2 h w"]:
-    """Update (s1, s2) by adding moves to atanh(s1) and atanh(s2)."""
-    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves)
-
-
 def averaged(
     stokes: Float[Tensor, "n 2 h w"],
     dolp: Float[Tensor, "n 1 h w"],

@@ -261,7 +261,7 @@ class StokesUNet(nn.Module):
         else:
             moves = refinement.event_moves(sums, self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float()))
         level = refinement.moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
-        moved = refinement.moved_by_events(level, scale * moves)
+        moved = torch.tanh(torch.atanh(refinement.MAX_DOLP * level) + scale * moves)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * blocks.enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(refinement.averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
