@@ -17,8 +17,7 @@ from polarnet.methods.rotating_polarizer import RotatingPolarizerConfig
 from polarnet.networks.base.checkpoint import save_checkpoint
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2p.network import E2p
-from polarnet.networks.e2v.e2vid import E2vid
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import E2vid, FireNet
 from polarnet.networks.paper.dolp_unet import DolpUNet, DolpUNetConfig
 
 HEIGHT, WIDTH = 18, 20

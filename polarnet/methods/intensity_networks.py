@@ -21,9 +21,7 @@ from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.method import Method, Recoverer, Setup, network_recoverer, weights_file
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.networks.cista_tc.network import CistaTc
-from polarnet.networks.e2v import ARCHITECTURES
-from polarnet.networks.e2v.e2vid import E2vid
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import ARCHITECTURES, E2vid, FireNet
 from polarnet.stokes import Prediction
 
 UNSHARP_AMOUNT, UNSHARP_SIGMA = 0.3, 1.0  # defaults of E2VID's authors; sigma in the units of their kernel

@@ -18,15 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from polarnet.runtime.arrays import (
-    Array,
-    as_tensor,
-    check_floating,
-    check_range,
-    check_same_shape,
-    check_shape,
-    mask_of,
-)
+from polarnet.runtime import arrays
+from polarnet.runtime.arrays import Array
 from polarnet.stokes import Prediction
 
 Valid = Bool[Array, "*b h w"] | None
@@ -213,18 +206,18 @@ def frame_scores(
 
 def _checked(valid: Valid, **frames: Array) -> tuple[list[Tensor], Tensor | None]:
     """Frames, checked to be floating-point and of one shape, and their mask, as tensors."""
-    tensors = {name: as_tensor(name, values) for name, values in frames.items()}
+    tensors = {name: arrays.as_tensor(name, values) for name, values in frames.items()}
     for name, values in tensors.items():
-        check_shape(name, values, "... height width")
-        check_floating(name, values)
-    check_same_shape(tensors)
+        arrays.check_shape(name, values, "... height width")
+        arrays.check_floating(name, values)
+    arrays.check_same_shape(tensors)
     first, *others = tensors.values()
-    return [first, *others], None if valid is None else mask_of("valid", valid, first.shape)
+    return [first, *others], None if valid is None else arrays.mask_of("valid", valid, first.shape)
 
 
 def _check_unit(truth: Tensor, valid: Tensor | None) -> None:
     """ValueError for a truth outside [0, 1]; a prediction may exceed it."""
-    check_range("b", truth if valid is None else torch.where(valid, truth, 0.0), 0, 1, "frames")
+    arrays.check_range("b", truth if valid is None else torch.where(valid, truth, 0.0), 0, 1, "frames")
 
 
 def _centred(frames: Tensor, valid: Tensor | None) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 from polarnet.training.engine.task import Baseline
 
 _NAMES = [name for _, name, _ in pkgutil.iter_modules([str(Path(__file__).parent)]) if name != "baselines"]
-_RECORDS = [getattr(importlib.import_module(f"{__package__}.{name}"), "BASELINE", None) for name in _NAMES]
+_MODULES = {name: importlib.import_module(f"{__package__}.{name}") for name in _NAMES}
 
-BASELINES: dict[str, Baseline] = {record.name: record for record in _RECORDS if record is not None}
-"""Baseline by name, the section of `baselines` in params.yaml."""
+BASELINES: dict[str, Baseline] = {n: module.BASELINE for n, module in _MODULES.items() if hasattr(module, "BASELINE")}
+"""Baseline by name of its module: its section of `baselines` in params.yaml, and its folder below data/train."""

@@ -12,8 +12,8 @@ from polarnet.events.representations import REPRESENTATIONS, channels_of
 from polarnet.metrics.lpips import Lpips
 from polarnet.networks.base.checkpoint import load_checkpoint, load_tensors
 from polarnet.training.engine.loop import TrainConfig
-from polarnet.training.engine.losses import LossConfig, PolarizationLoss
-from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.losses import LossConfig, polarization_loss
+from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import State, Task, initialised
 
 FITTED = "expected."  # tensors of the expected errors, which every training fits anew
@@ -46,16 +46,12 @@ def dolp_task(
             maps = torch.cat([maps, prediction.stokes], dim=2)
         return maps, state
 
-    def unroll_with_features(inputs: Tensor, state: State) -> tuple[Tensor, Tensor, State]:
-        prediction, features, state = network.unroll_with_features(inputs, state)
-        return prediction.dolp, features, state
-
     return Task(
         network=network,
         encode=encode,
         streams=lambda batch: (batch.inputs, normalised_stokes(batch), batch.valid),
         unroll=unroll,
-        loss=PolarizationLoss(loss, lpips, dolp_only=not build.predicts_stokes),
+        loss=polarization_loss(loss, lpips, dolp_only=not build.predicts_stokes),
         description={
             "network": name,
             "config": asdict(network_config),
@@ -67,12 +63,11 @@ def dolp_task(
         wants_intensity=False,
         optimizer=config.optimizer or build.optimizer,
         scored=lambda maps: maps[:, :, 0],
-        unroll_with_features=unroll_with_features if build.predicts_stokes else None,
         scene_dolp=config.scene_dolp,
     )
 
 
-def normalised_stokes(batch: Batch) -> Float[Tensor, "t b 3 h w"]:
+def normalised_stokes(batch: Windows) -> Float[Tensor, "t b 3 h w"]:
     """Stack the truth of a batch: DoLP, s1 = S1 / S0 and s2 = S2 / S0."""
     angle = 2 * batch.aolp
     return torch.stack([batch.dolp, batch.dolp * torch.cos(angle), batch.dolp * torch.sin(angle)], dim=2)

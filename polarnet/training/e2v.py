@@ -8,11 +8,11 @@ from torch import Tensor
 from polarnet.events.representations import normalise_nonzero, voxel_grid
 from polarnet.events.stream import Events
 from polarnet.metrics.lpips import Lpips
-from polarnet.networks.e2v import ARCHITECTURES
+from polarnet.networks.e2v.network import ARCHITECTURES
 from polarnet.runtime.sections import one_of, section
 from polarnet.training.engine.loop import LoopConfig
-from polarnet.training.engine.losses import FrameLoss
-from polarnet.training.engine.sequences import Batch
+from polarnet.training.engine.losses import Loss, frame_terms
+from polarnet.training.engine.sequences import Windows
 from polarnet.training.engine.task import Baseline, Task, initialised
 
 
@@ -39,7 +39,7 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
     def encode(events: Events, window_us: int) -> Tensor:
         return normalise_nonzero(voxel_grid(events, config.bins))
 
-    def streams(batch: Batch) -> tuple[Tensor, Tensor, Tensor | None]:
+    def streams(batch: Windows) -> tuple[Tensor, Tensor, Tensor | None]:
         voxels = batch.inputs.unflatten(2, (4, config.bins))
         valid = None if batch.valid is None else batch.valid.repeat_interleave(4, dim=1)
         return voxels.flatten(1, 2), batch.intensity.flatten(1, 2), valid
@@ -49,7 +49,7 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
         encode=encode,
         streams=streams,
         unroll=network.unroll,
-        loss=FrameLoss({"mae": 1.0, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips),
+        loss=Loss(frame_terms({"mae": 1.0, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips)),
         description={
             "network": config.arch,
             "config": {"bins": config.bins},
@@ -59,4 +59,4 @@ def e2v_task(config: E2vConfig, lpips: Lpips | None, seed: int) -> Task:
     )
 
 
-BASELINE = Baseline("e2v", E2vConfig, e2v_task, lpips=("lpips",))
+BASELINE = Baseline(E2vConfig, e2v_task, lpips=("lpips",))

@@ -18,7 +18,7 @@ from polarnet.methods.intensities import from_intensities, with_gain
 from polarnet.methods.intensity_networks import intensity_methods, load_baseline, sharper
 from polarnet.methods.method import Method, Recoverer, weights_record, why_absent
 from polarnet.networks.e2p.network import E2p, interleaved
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import FireNet
 from polarnet.networks.polarnet.stokes_unet import StokesUNet
 from polarnet.stokes import Prediction, intensities_from_stokes, stokes_from_polarization
 

@@ -9,8 +9,7 @@ from test_stokes_unet import moving_events, network
 
 from polarnet.networks.cista_tc.network import CistaTc
 from polarnet.networks.e2p.network import E2p
-from polarnet.networks.e2v.e2vid import E2vid
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import E2vid, FireNet
 from polarnet.networks.paper.dolp_unet import DolpUNet
 from polarnet.stokes import Prediction
 

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from polarnet.networks.cista_tc.network import CistaTc
-from polarnet.networks.e2v.e2vid import ConvLstm, E2vid, reflected
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import ConvLstm, E2vid, FireNet, reflected
 
 
 def official_tensors():

@@ -162,7 +162,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
     [
         thorough("methods/overlap.py", ROWS | {"report"}),
         thorough("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
-        thorough("networks/e2v/firenet.py", {"train_baseline@e2v", "report"} | ROWS),
+        thorough("networks/e2v/network.py", {"train_baseline@e2v", "report"} | ROWS),
         thorough("networks/registry.py", {"report"} | ROWS),
         thorough("training/dolp.py", {"train"}),
         thorough("simulation/pixels/exact.py", (FROM_SIMULATION | ROWS) - {"ingest"}),

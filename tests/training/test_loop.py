@@ -11,8 +11,7 @@ import torch
 from part_fixtures import files_of
 
 from polarnet.networks.base.checkpoint import load_checkpoint
-from polarnet.networks.e2v.e2vid import E2vid
-from polarnet.networks.e2v.firenet import FireNet
+from polarnet.networks.e2v.network import E2vid, FireNet
 from polarnet.networks.paper.dolp_unet import DolpUNetConfig
 from polarnet.networks.registry import load_network
 from polarnet.runtime.files import SUMS

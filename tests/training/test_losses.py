@@ -3,7 +3,7 @@ import torch
 
 from polarnet.metrics.lpips import Lpips
 from polarnet.metrics.similarity import ssim
-from polarnet.training.engine.losses import FrameLoss, LossConfig, PolarizationLoss
+from polarnet.training.engine.losses import Loss, LossConfig, frame_terms, polarization_loss
 
 
 def frames(value: float) -> torch.Tensor:
@@ -11,7 +11,7 @@ def frames(value: float) -> torch.Tensor:
 
 
 def test_constant_frames_half_apart_and_a_loss_of_nothing_or_without_its_network():
-    terms = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None)(frames(0.25), frames(0.75))
+    terms = Loss(frame_terms({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0}, None))(frames(0.25), frames(0.75))
     assert terms["mse"].item() == 0.25
     assert terms["mae"].item() == 0.5
     luminance = (2 * 0.25 * 0.75 + 0.01**2) / (0.25**2 + 0.75**2 + 0.01**2)  # all that SSIM sees of constants
@@ -22,9 +22,9 @@ def test_constant_frames_half_apart_and_a_loss_of_nothing_or_without_its_network
         of_dolp(0.0, 0.0, 0.0)
 
 
-def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> PolarizationLoss:
+def of_dolp(mse: float, ssim: float, lpips: float, network: Lpips | None = None) -> Loss:
     config = LossConfig(mse=mse, ssim=ssim, lpips=lpips, stokes=1.0, half_weight=None)
-    return PolarizationLoss(config, network, dolp_only=True)
+    return polarization_loss(config, network, dolp_only=True)
 
 
 def test_the_total_is_equation_9_with_lpips_where_there_is_a_network():
@@ -45,7 +45,7 @@ def of_everything(dolp: float, s1: float, s2: float) -> torch.Tensor:
 
 def test_angles_are_judged_where_a_network_predicts_them_at_valid_pixels():
     config = LossConfig(mse=1.0, ssim=0.0, lpips=0.0, stokes=2.0, half_weight=None)
-    loss = PolarizationLoss(config, None, dolp_only=False)
+    loss = polarization_loss(config, None, dolp_only=False)
     predicted, truth = of_everything(0.5, 0.3, 0.4), of_everything(0.4, 0.1, 0.4)
     terms = loss(predicted, truth)
     assert {name: round(term.item(), 5) for name, term in terms.items()} == {"mse": 0.01, "stokes": 0.04}
@@ -56,11 +56,11 @@ def test_angles_are_judged_where_a_network_predicts_them_at_valid_pixels():
     assert [term.item() for term in terms.values()] == [0, 0]
 
 
-def of_two_frames(half_weight: float | None) -> tuple[PolarizationLoss, torch.Tensor, torch.Tensor]:
+def of_two_frames(half_weight: float | None) -> tuple[Loss, torch.Tensor, torch.Tensor]:
     """A loss, and predictions and truths of an unpolarized frame and of one with a mean squared DoLP of 0.25."""
     config = LossConfig(mse=2.0, ssim=0.0, lpips=0.0, stokes=3.0, half_weight=half_weight)
     truth = torch.stack([of_everything(0.0, 0.0, 0.0)[0, 0], of_everything(0.5, 0.3, 0.4)[0, 0]])[:, None]
-    return (PolarizationLoss(config, None, dolp_only=False), truth + torch.tensor([0.1, 0.2, 0])[:, None, None], truth)
+    return (polarization_loss(config, None, dolp_only=False), truth + torch.tensor([0.1, 0.2, 0])[:, None, None], truth)
 
 
 def test_with_a_half_weight_polarized_frames_count_half_and_masked_ones_not_at_all():
@@ -89,7 +89,7 @@ def test_with_a_half_weight_polarized_frames_count_half_and_masked_ones_not_at_a
 def test_masked_pixels_and_frames_count_in_no_term_and_get_no_gradient():
     torch.manual_seed(0)
     lpips = Lpips("vgg")
-    loss = FrameLoss({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0, "lpips": 1.0}, lpips)
+    loss = Loss(frame_terms({"mse": 1.0, "mae": 1.0, "ssim_loss": 1.0, "lpips": 1.0}, lpips))
     truth = torch.rand(2, 2, 32, 32)
     predicted = torch.rand(2, 2, 32, 32, requires_grad=True)
     valid = torch.rand(2, 2, 32, 32) < 0.8

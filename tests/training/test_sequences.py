@@ -15,24 +15,23 @@ from polarnet.training.engine.sequences import (
     ViewConfig,
     Visits,
     WindowDataset,
-    WindowSequence,
+    Windows,
     apply_view,
     batches_of,
     loaded_if_it_fits,
     packed,
     random_view,
-    shuffled,
     stack,
 )
 
 
-def sequence(name: str = "s", windows: int = 3, height: int = 6, width: int = 8) -> WindowSequence:
+def sequence(name: str = "s", windows: int = 3, height: int = 6, width: int = 8) -> Windows:
     """Truth that is exact: intensities follow from S0, DoLP and AoLP, and the inputs are the intensities twice over."""
     torch.manual_seed(len(name))
     s0, dolp, fraction = torch.rand(3, windows, height, width)
     aolp = math.pi * fraction
     intensity = stokes.intensities_from_stokes(stokes.stokes_from_polarization(s0, dolp, aolp))
-    return WindowSequence(name, intensity.repeat_interleave(2, dim=1), dolp, aolp, intensity)
+    return Windows([name], intensity.repeat_interleave(2, dim=1), dolp, aolp, intensity)
 
 
 WHOLE = View(slice(0, 3), slice(0, 6), slice(0, 8), mirrored=(), turn=0, direction=1)
@@ -73,8 +72,8 @@ def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views()
     config = ViewConfig(visits=3, windows=1, crop=None, symmetries=True)
     visits = Visits([sequence("a"), sequence("bb")], config, seed=1, epoch=0)
     views = [visits[index] for index in range(len(visits))]
-    assert sorted(one.name for one in views) == ["a", "a", "a", "bb", "bb", "bb"]
-    firsts = [one.inputs for one in views if one.name == "a"]
+    assert sorted(name for one in views for name in one.names) == ["a", "a", "a", "bb", "bb", "bb"]
+    firsts = [one.inputs for one in views if one.names == ["a"]]
     assert not torch.equal(firsts[0], firsts[1])
     assert torch.equal(visits[0].inputs, visits[0].inputs)
 
@@ -82,7 +81,7 @@ def test_an_epoch_visits_each_sequence_as_often_as_it_should_under_other_views()
 def test_an_item_is_a_whole_sequence_with_the_truth_at_each_windows_end(stores):
     events, frames = EventStore.open(stores[0]), FrameStore.open(stores[1])
     item = WindowDataset(events, frames, ["b", "a"], event_tensor)[0]
-    assert item.name == "b"
+    assert item.names == ["b"]
     t_us, intensity, dolp, aolp, _ = frames.frames("b")
     for k, (start, stop) in enumerate(itertools.pairwise(t_us.tolist())):
         for c, channel in enumerate(events.read("b")):
@@ -95,7 +94,7 @@ def test_an_item_is_a_whole_sequence_with_the_truth_at_each_windows_end(stores):
 def test_a_dataset_in_memory_is_read_once_by_this_process_or_by_workers(stores, workers):
     dataset = WindowDataset(EventStore.open(stores[0]), FrameStore.open(stores[1]), ["a", "b"], event_tensor)
     loaded = loaded_if_it_fits(dataset, intensity=True, workers=workers)
-    assert [one.name for one in loaded] == ["a", "b"]
+    assert [one.names for one in loaded] == [["a"], ["b"]]
     assert loaded[1] is loaded[1]
     assert torch.equal(loaded[1].inputs, dataset[1].inputs)
     assert not any(one.inputs.is_shared() for one in loaded)
@@ -142,9 +141,12 @@ def test_a_crop_a_batch_and_stores_that_do_not_fit_are_refused(stores, tmp_path)
 
 
 def test_the_order_is_a_permutation_and_batches_follow_it_with_a_small_last_one():
-    assert sorted(shuffled(9, seed=1, epoch=0)) == list(range(9))
-    assert shuffled(9, seed=1, epoch=0) == shuffled(9, seed=1, epoch=0)
-    assert len({tuple(shuffled(9, seed, epoch)) for seed in (1, 2) for epoch in (0, 1)}) == 4
+    def shuffled(seed: int, epoch: int) -> list[int]:
+        return Visits([sequence()] * 9, PLAIN, seed, epoch).order()
+
+    assert sorted(shuffled(seed=1, epoch=0)) == list(range(9))
+    assert shuffled(seed=1, epoch=0) == shuffled(seed=1, epoch=0)
+    assert len({tuple(shuffled(seed, epoch)) for seed in (1, 2) for epoch in (0, 1)}) == 4
     dataset = Visits([sequence("a"), sequence("bb"), sequence("ccc")], PLAIN, seed=1, epoch=0)
     names = [batch.names for batch in batches_of(dataset, [2, 0, 1], batch_size=2, workers=0)]
     assert names == [["ccc", "a"], ["bb"]]

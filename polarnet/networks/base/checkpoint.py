@@ -79,22 +79,17 @@ def _digest(content: bytes, metadata: Mapping[str, Any]) -> str:
     return sha256(content, json.dumps(plain, sort_keys=True).encode())
 
 
-def nested(metadata: Mapping[str, Any], *keys: str) -> Mapping[str, Any]:
-    """The record at nested keys of a checkpoint's metadata, empty if there is none; ValueError for another value."""
-    record = metadata
-    for key in keys:
-        record = record.get(key, {})
-        if not isinstance(record, Mapping):
-            raise ValueError(f"{key}: expected a record of the training, got {str(record)[:80]!r}")
-    return record
-
-
 def trained_window_us(metadata: Mapping[str, Any]) -> int | None:
     """Return the length of a training's windows in microseconds; None unless its events were simulated.
 
-    ValueError for a frame rate that no simulation has.
+    ValueError for a frame rate that no simulation has, or for a value where the record of the training is.
     """
-    rate_hz = nested(metadata, "data", "events_from", "scenes", "synthesize").get("frame_rate_hz")
+    record = metadata
+    for key in ("data", "events_from", "scenes", "synthesize"):
+        record = record.get(key, {})
+        if not isinstance(record, Mapping):
+            raise ValueError(f"{key}: expected a record of the training, got {str(record)[:80]!r}")
+    rate_hz = record.get("frame_rate_hz")
     if rate_hz is None:
         return None
     if not isinstance(rate_hz, int | float) or not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:

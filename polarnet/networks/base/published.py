@@ -1,4 +1,4 @@
-"""Base class of recurrent networks that others published, and the layers of FireNet, which E2P shares."""
+"""Base class of recurrent networks that others published, and the layers of FireNet, which E2P and E2VID share."""
 
 import os
 import pickle
@@ -61,23 +61,14 @@ class PublishedNetwork(nn.Module):
         return dict(tensors)
 
 
-class StandIn:
-    """Empty replacement for an object of the authors' code in a file of which only the tensors are needed."""
-
-    def __init__(self, *arguments: Any):
-        pass
-
-    def __setstate__(self, state: Any) -> None:
-        pass
-
-
 def read_content(path: str | os.PathLike[str]) -> Any:
-    """Load a torch file, with `StandIn`s for objects of the authors' code; ValueError if torch cannot read it."""
+    """Load a torch file, with empty objects for those of the authors' code; ValueError if torch cannot read it."""
     try:
         unknown = torch.serialization.get_unsafe_globals_in_checkpoint(path)
     except (ValueError, RuntimeError):  # files older than torch's zip format, which hold no such objects
         unknown = []
-    inert: list[Any] = [(type(name.rpartition(".")[2], (StandIn,), {}), name) for name in unknown]
+    ignoring = {"__init__": lambda self, *arguments: None, "__setstate__": lambda self, state: None}
+    inert: list[Any] = [(type(name.rpartition(".")[2], (), ignoring), name) for name in unknown]
     try:
         with torch.serialization.safe_globals(inert):
             return torch.load(path, map_location="cpu", weights_only=True)
@@ -107,13 +98,15 @@ class ConvGRU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """FireNet's residual block relu(x + conv(relu(conv(x))))."""
+    """FireNet's residual block relu(x + conv(relu(conv(x)))); E2VID's has batch normalisation after each conv."""
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, normalised: bool = False):
         super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1, bias=not normalised)
+        self.bn1 = nn.BatchNorm2d(channels) if normalised else nn.Identity()
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=not normalised)
+        self.bn2 = nn.BatchNorm2d(channels) if normalised else nn.Identity()
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """Return a tensor of the same shape."""
-        return self.conv2(self.conv1(x).relu_()).add_(x).relu_()
+        return self.bn2(self.conv2(self.bn1(self.conv1(x)).relu_())).add_(x).relu_()

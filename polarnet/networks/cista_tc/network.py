@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from polarnet.networks.base.published import PublishedNetwork
-from polarnet.networks.e2v.e2vid import Recurrent, convolution, reflected
+from polarnet.networks.e2v.network import Recurrent, convolution, reflected
 
 CHANNELS = 64  # features at half resolution
 ATOMS = 128  # channels of the sparse code

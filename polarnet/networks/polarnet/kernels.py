@@ -2,10 +2,13 @@
 
 The torch functions named in the docstrings are the definitions, used for training, on GPUs and for ONNX;
 `compiled_path` decides. Most kernels handle one window of one stream. Threads share strips of rows, and the sums of a
-strip do not depend on the number of threads. Arrays are float32 and contiguous.
+strip do not depend on the number of threads. Arrays are float32 and contiguous; kernels take them as tensors, too.
 """
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,12 +31,12 @@ def compiled_path(x: Tensor) -> bool:
     return plain and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
 
 
-def _row(kernel):
-    return compiled(kernel, fastmath=FAST)
+_row = functools.partial(compiled, fastmath=FAST)
 
 
-def _strips(kernel):
-    return parallel(kernel, fastmath=FAST)
+def _strips(kernel: Callable) -> Any:
+    run = parallel(kernel, fastmath=FAST)
+    return lambda *arguments: run(*(x.numpy() if isinstance(x, Tensor) else x for x in arguments))
 
 
 @_row
@@ -260,12 +263,6 @@ def weigh(
             _weighted(polarity[k, y], count[k, y], change[c, y], balance[c], sign, polarities[k, y], events[k, y])
 
 
-@_row
-def _add(values, sums):
-    for i in range(len(sums)):
-        sums[i] += values[i]
-
-
 @_strips
 def box_means(images: Float32[np.ndarray, "c h w"], side, means: Float32[np.ndarray, "c h w"]):
     """Write `redundancy.box_means` of a width of `side` pixels."""
@@ -276,10 +273,10 @@ def box_means(images: Float32[np.ndarray, "c h w"], side, means: Float32[np.ndar
         first, last = max(y - half, 0), min(y + half, height - 1)
         padded, out = np.zeros(width + 2 * half, np.float32), means[c, y]
         for k in range(first, last + 1):
-            _add(images[c, k], padded[half : half + width])
+            _add_scaled(images[c, k], F32(1), padded[half : half + width])
         out[:] = 0
         for k in range(side):
-            _add(padded[k : k + width], out)
+            _add_scaled(padded[k : k + width], F32(1), out)
         for x in range(width):
             inside = (last + 1 - first) * (min(x + half, width - 1) + 1 - max(x - half, 0))
             out[x] /= F32(inside)

@@ -69,7 +69,7 @@ class Panorama(NamedTuple):
 def empty_panorama(like: Float[Tensor, "b c h w"], margin: int) -> Panorama:
     """Return the initial state for images of the size of `like`, with a margin of at least `margin` pixels."""
     b, c, h, w = like.shape
-    height, width = _rounded(h + margin, w + margin)
+    height, width = (-(-(side + margin) // ROUND) * ROUND for side in (h, w))
     explained = like.new_zeros(b, 4, height, width // 2 + 1)
     return Panorama(like.new_zeros(b, c, height, width), like.new_zeros(b, c, h, w), explained)
 
@@ -100,10 +100,6 @@ def displacements(images: Float[Tensor, "t1 b h w"], reach: int) -> Motion:
     y = (best // side - reach) + _vertex(above, middle, below)
     energy = images.square().sum((-2, -1)).sqrt()
     return Motion(torch.stack([x, y], dim=-1), middle > MIN_CORRELATION * (energy[:-1] * energy[1:]).clamp(min=1e-6))
-
-
-def _rounded(height: int, width: int) -> tuple[int, int]:
-    return -(-height // ROUND) * ROUND, -(-width // ROUND) * ROUND
 
 
 def _vertex(left: Float[Tensor, "*n"], middle: Float[Tensor, "*n"], right: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:

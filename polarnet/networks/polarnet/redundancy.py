@@ -121,12 +121,9 @@ class LeastSquares(nn.Module):
         if kernels.compiled_path(moments):
             n, *candidates, _, height, width = moments.shape
             s1, s2 = moments.new_empty(2, n, math.prod(candidates), height, width)
-            ridges, limits = (
-                self.log_ridge.exp().flatten().numpy(),
-                np.array([MIN_EVIDENCE, MAX_CORRELATION], np.float32),
-            )
+            ridges, limits = self.log_ridge.exp().flatten(), np.array([MIN_EVIDENCE, MAX_CORRELATION], np.float32)
             flat = moments.flatten(1, 3).flatten(-2).contiguous()
-            kernels.least_squares(flat.numpy(), ridges, *limits, s1.flatten(-2).numpy(), s2.flatten(-2).numpy())
+            kernels.least_squares(flat, ridges, *limits, s1.flatten(-2), s2.flatten(-2))
             return s1, s2, moments[:, :, :, :, -1].flatten(1, 3)
         aa, ab, bb, ac, bc, steps = moments.unbind(4)
         ridge = self.log_ridge.exp()[..., None, None] * steps + MIN_EVIDENCE
@@ -170,7 +167,7 @@ def box_means(x: Float[Tensor, "n c h w"], width: int) -> Float[Tensor, "n c h w
     channels, rows, columns = x.shape[-3:]
     if kernels.compiled_path(x):
         means = torch.empty(x.shape)
-        kernels.box_means(x.reshape(-1, rows, columns).numpy(), width, means.view(-1, rows, columns).numpy())
+        kernels.box_means(x.reshape(-1, rows, columns), width, means.view(-1, rows, columns))
         return means
     ones = x.new_ones(channels, 1, 1, width)
     with torch.autocast(x.device.type, enabled=False):

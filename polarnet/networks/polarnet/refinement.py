@@ -126,13 +126,8 @@ def compiled_event_moves(
     for n, pixels in enumerate(y.permute(0, 2, 3, 1)):
         gains = torch.addmm(layer.bias[:, None], layer.weight.flatten(1), pixels.flatten(0, 1).T).float()
         for gain, near in zip(gains.unflatten(1, pixels.shape[:2]).chunk(len(sums)), sums, strict=True):
-            kernels.add_moves(near.flatten(0, 1)[n].numpy(), gain.numpy(), moves[n].numpy())
+            kernels.add_moves(near.flatten(0, 1)[n], gain, moves[n])
     return moves
-
-
-def moved_by_events(stokes: Float[Tensor, "n 2 h w"], moves: Float[Tensor, "n 2 h w"]) -> Float[Tensor, "n 2 h w"]:
-    """Update (s1, s2) by adding moves to atanh(s1) and atanh(s2)."""
-    return torch.tanh(torch.atanh(MAX_DOLP * stokes) + moves)
 
 
 def averaged(

@@ -77,7 +77,7 @@ class Equaliser(nn.Module):
         weighted, sums, mismatches = [], [], []
         for now in events:
             totals = totals + now
-            mean = _near(torch.addcmul(totals, totals, change))
+            mean = enlarged(box_means(block_means(torch.addcmul(totals, totals, change), BLOCK), BLOCKS), BLOCK)
             some, some_mean = totals[..., ::SPARSE, ::SPARSE], mean[..., ::SPARSE, ::SPARSE]
             deviation = torch.minimum((some - some_mean).abs(), OUTLIER * (some_mean + 1))
             power = some_mean.square().mean((-1, -2), keepdim=True).clamp(min=MIN_POWER)
@@ -109,29 +109,24 @@ class Equaliser(nn.Module):
         strips = np.empty((height, 8, 2), np.float32)
         sums, mismatches = [], []
         for k in range(len(polarity)):
-            window = (polarity[k, 0].numpy(), count[k, 0].numpy())
+            window = (polarity[k, 0], count[k, 0])
             blocks, after = polarity.new_empty(1, 8, height, width), torch.empty_like(totals)
-            kernels.add_events(*window, totals[0].numpy(), change[0].numpy(), after[0].numpy(), blocks[0].numpy())
+            kernels.add_events(*window, totals[0], change[0], after[0], blocks[0])
             near = box_means(blocks, BLOCKS)[0].numpy()
             totals, change = after, torch.empty_like(totals)
-            kernels.deviations(totals[0].numpy(), near, noise[()], np.float32(OUTLIER), strips)
+            kernels.deviations(totals[0], near, noise[()], np.float32(OUTLIER), strips)
             power, excess = (strips.sum(0, dtype=np.float64) / (4 * height * width)).T
             mismatch = (excess / power.clip(MIN_POWER)).clip(*MISMATCH)
             mean_counts = near.mean((1, 2), dtype=np.float64)  # interpolation keeps the mean
             on, off = mean_counts[:4].mean() + surplus, mean_counts[4:].mean() + surplus
             balance = np.sqrt([off / on, on / off]).repeat(4).astype(np.float32)
             prior = (pull * noise / mismatch).astype(np.float32)
-            images = (image.numpy() for image in (change[0], polarities[k, 0], events[k, 0]))
-            kernels.weigh(*window, totals[0].numpy(), near, prior, balance, limits, *images)
+            images = (change[0], polarities[k, 0], events[k, 0])
+            kernels.weigh(*window, totals[0], near, prior, balance, limits, *images)
             sums.append(mean_counts.mean())
             mismatches.append(mismatch.mean())
         summary = polarity.new_tensor([sums, mismatches])[..., None]
         return Equalised(polarities, events, *summary), [totals, change]
-
-
-def _near(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-    """Return means over the neighbourhood of each pixel."""
-    return enlarged(box_means(block_means(x, BLOCK), BLOCKS), BLOCK)
 
 
 class Scale(nn.Module):

@@ -261,7 +261,7 @@ class StokesUNet(nn.Module):
         else:
             moves = refinement.event_moves(sums, self._unless("sums", F.pixel_shuffle(self.gains(y2), 2).float()))
         level = refinement.moved_by_noise(coarse[:, :2], self._unless("shot_noise", self.shot_noise(noise)))
-        moved = refinement.moved_by_events(level, scale * moves)
+        moved = torch.tanh(torch.atanh(refinement.MAX_DOLP * level) + scale * moves)
         dolp = coarse[:, 2:] + (length(*moved.unbind(1)) - length(*coarse[:, :2].unbind(1)))[:, None]
         share = certain * blocks.enlarged(torch.sigmoid(self.trust(y2).float()), 2)
         fine = torch.cat(refinement.averaged(moved, dolp, images[:, 1:3], share, self.around), dim=1)
@@ -277,12 +277,6 @@ class StokesUNet(nn.Module):
         maps = [dolp, aolp, log_variance, stokes]
         prediction = Prediction(*(image[..., :height, :width].unflatten(0, (t, b)) for image in maps))
         return prediction, self._enlarged(features), recurrent
-
-    @torch.no_grad()
-    def expect(self, weight: Float[Tensor, " k"], bias: float) -> None:
-        """Set the log-variance to weight @ features + bias."""
-        self.expected.weight.copy_(weight)
-        self.expected.bias.fill_(bias)
 
     def _event_sums(
         self,
@@ -312,23 +306,15 @@ class StokesUNet(nn.Module):
         moments = polarity.new_empty(t * b, memories, redundancy.MOMENTS, height // 4, width // 4)
         half = torch.is_autocast_enabled("cpu")
         images = torch.empty(t * b, 4 * memories + 1, height, width, dtype=torch.uint16 if half else torch.float32)
-        noise = self.moments.factors().numpy()
+        noise = self.moments.factors()
         before = torch.zeros_like(steps[0]) if before is None else before
         polarity, count = polarity.contiguous(), count.contiguous()
         for n in range(t * b):
             k, stream = divmod(n, b)
-            kernels.sums_and_moments(
-                (before if k == 0 else steps[k - 1])[stream].numpy(),
-                polarity[k, stream].numpy(),
-                count[k, stream].numpy(),
-                scale[n].numpy()[0, 0, 0],
-                self.memories.numpy(),
-                noise,
-                half,
-                steps[k, stream].numpy(),
-                moments[n].numpy(),
-                images[n].numpy(),
-            )
+            sums = (before if k == 0 else steps[k - 1])[stream]
+            window = (polarity[k, stream], count[k, stream], scale[n].numpy()[0, 0, 0])
+            outputs = (steps[k, stream], moments[n], images[n])
+            kernels.sums_and_moments(sums, *window, self.memories, noise, half, *outputs)
         return steps, moments, images.view(torch.bfloat16) if half else images
 
     def _candidates(

@@ -21,15 +21,7 @@ from polarnet.training.engine.calibration import Scene, fitted, joined, weights_
 from polarnet.training.engine.losses import known_frames
 from polarnet.training.engine.optimizers import OPTIMIZERS, Optimizer
 from polarnet.training.engine.recorder import Recorder
-from polarnet.training.engine.sequences import (
-    Batch,
-    ViewConfig,
-    Visits,
-    WindowDataset,
-    batches_of,
-    loaded_if_it_fits,
-    shuffled,
-)
+from polarnet.training.engine.sequences import ViewConfig, Visits, WindowDataset, Windows, batches_of, loaded_if_it_fits
 from polarnet.training.engine.task import Split, State, Task
 
 SCORES = {"mse": mse, "psnr": psnr, "correlation": correlation}
@@ -98,15 +90,15 @@ def train(
     optimizer = OPTIMIZERS[task.optimizer](network, config.learning_rate)
     recorder.resume(network, optimizer)
     helpers = workers if device.type == "cuda" else 0  # on a processor, the training itself needs the cores
-    trained = len(recorder.history) == config.epochs
-    loaded = None if trained else loaded_if_it_fits(split.train, task.wants_intensity, helpers)
+    epochs = range(len(recorder.history), config.epochs)
+    loaded = loaded_if_it_fits(split.train, task.wants_intensity, helpers) if epochs else None
     sequences, workers = (split.train, workers) if loaded is None else (loaded, helpers)
-    for epoch in range(len(recorder.history), config.epochs):
+    for epoch in epochs:
         visits = Visits(sequences, config, seed, epoch)
         means = train_epoch(task, optimizer, visits, config, device, workers)
         scores = validate(task, split.val, config, device, workers)
         recorder.end_epoch(network, optimizer, means, scores)
-    if task.unroll_with_features is not None:
+    if hasattr(network, "expected"):
         network.load_state_dict(recorder.best)
         recorder.calibrated(network, calibrate(task, sequences_to_fit(task, split.train), config, device, workers))
     recorder.finish()
@@ -117,7 +109,7 @@ def train_epoch(
 ) -> dict[str, float]:
     """Return means of the loss and its terms over the steps; FloatingPointError if a loss is infinite or NaN."""
     sums, steps, done = Counter[str](), 0, 0
-    order, title = shuffled(len(visits), visits.seed, visits.epoch), f"epoch {visits.epoch + 1}/{config.epochs}"
+    order, title = visits.order(), f"epoch {visits.epoch + 1}/{config.epochs}"
     with ProgressBar(total=len(order), desc=title, unit="visit") as bar:
         for batch in batches_of(visits, order, config.batch_size, workers):
             set_learning_rate(optimizer, config, (visits.epoch + done / len(order)) / config.epochs)
@@ -136,7 +128,7 @@ def train_epoch(
 
 
 def train_batch(
-    task: Task, optimizer: Optimizer, batch: Batch, config: LoopConfig, device: torch.device
+    task: Task, optimizer: Optimizer, batch: Windows, config: LoopConfig, device: torch.device
 ) -> list[dict[str, float]]:
     """Take one optimizer step per run of `bptt_windows` windows; return the loss and its terms at each step."""
     state: State = None
@@ -157,10 +149,10 @@ def train_batch(
     return losses
 
 
-def runs_of(task: Task, batch: Batch, length: int, device: torch.device) -> Iterator[Run]:
+def runs_of(task: Task, batch: Windows, length: int, device: torch.device) -> Iterator[Run]:
     """Yield runs of `length` windows of a batch, on the device."""
     read = batch if task.wants_intensity else batch._replace(intensity=batch.intensity[:0])
-    there = Batch(read.names, *(None if field is None else field.to(device) for field in read[1:]))  # type: ignore
+    there = Windows(read.names, *(None if field is None else field.to(device) for field in read[1:]))  # type: ignore
     inputs, truth, valid = task.streams(there._replace(inputs=there.inputs.float()))
     windows, frames = inputs.split(length), truth.split(length)
     masks = [None] * len(frames) if valid is None else valid.split(length)
@@ -247,12 +239,12 @@ def calibrate(
     for name, scene in scenes.items():
         of_pictures.setdefault(dataset.frames.original_of(name), []).append(scene)
     fit = fitted([joined(of_picture) for of_picture in of_pictures.values()])
-    task.network.expect(fit.weight, fit.bias)  # type: ignore[operator]
+    task.network.get_submodule("expected").load_state_dict({"weight": fit.weight, "bias": torch.tensor(fit.bias)})
     task.network.train()
     return {"sequences": len(scenes), "mse": fmean(mean_squared), "ridge": fit.ridge}
 
 
-def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
+def sampled_sequence(task: Task, batch: Windows, config: LoopConfig, device: torch.device) -> tuple[Scene, float]:
     """Sampled errors of a batch's only sequence and of one frame without events, and the MSE without that frame."""
     every = max(1, round(math.sqrt(batch.dolp.numel() / 4 / MAX_BLOCKS)))  # along each axis
     samples: list[Scene] = []
@@ -269,11 +261,10 @@ def sampled_sequence(task: Task, batch: Batch, config: LoopConfig, device: torch
 
 def sampled_errors(task: Task, run: Run, state: State, every: int, precision: str) -> tuple[Scene, State]:
     """Features and squared errors of one 2x2-pixel block in `every` along each axis, and the state after the run."""
-    assert task.unroll_with_features is not None
     windows, frames, valid = run
     with autocast(precision, windows.device):
-        predicted, features, state = task.unroll_with_features(windows, state)
-    errors = (predicted.clamp(0, 1) - task.scored(frames)).square()
+        predicted, features, state = task.network.unroll_with_features(windows, state)  # type: ignore[operator]
+    errors = (predicted.dolp.clamp(0, 1) - task.scored(frames)).square()
     known = torch.ones_like(errors) if valid is None else valid.to(errors)
     squared, share_known = (avg_pool2d(image.flatten(0, 1), 2)[:, ::every, ::every] for image in (errors, known))
     height, width = (every * size for size in squared.shape[-2:])

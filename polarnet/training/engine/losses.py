@@ -1,6 +1,7 @@
 """Training losses (paper Eq. 6-9)."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,7 +13,9 @@ from polarnet.metrics.similarity import mean_where, mse, ssim, with_truth_outsid
 from polarnet.runtime.sections import section
 
 Frames = Float[Tensor, "t b h w"]
+Maps = Float[Tensor, "t b *k h w"]
 Valid = Bool[Tensor, "t b h w"] | None
+Term = Callable[[Maps, Maps, Valid], Float[Tensor, ""]]
 
 
 @section
@@ -46,73 +49,73 @@ def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor
     return a[known], b[known], frames[known]
 
 
-class FrameLoss:
-    """A weighted sum of mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips, each a mean over all frames.
+class Loss:
+    """A weighted sum of terms by name, without those of weight 0."""
 
-    Invalid pixels (see `polarnet.metrics.similarity`) and frames without a valid pixel count in no term.
-    ValueError if LPIPS has a weight but `lpips` is None.
-    """
+    def __init__(self, terms: Mapping[str, tuple[float, Term]]):
+        self.weights = {name: weight for name, (weight, _) in terms.items() if weight}
+        self._terms = {name: terms[name][1] for name in self.weights}
 
-    def __init__(self, weights: Mapping[str, float], lpips: Lpips | None):
-        if lpips is None and weights.get("lpips", 0) > 0:
-            raise ValueError(f"lpips: its weight is {weights['lpips']}, but there is no LPIPS network; load one")
-        known: dict[str, Callable[[Tensor, Tensor, Tensor | None], Tensor]] = {
-            "mse": mse,
-            "mae": lambda a, b, valid: (a - b).abs() if valid is None else mean_where((a - b).abs(), valid),
-            "ssim_loss": lambda a, b, valid: 1 - ssim(a, b, valid),
-        }
-        if lpips is not None:
-            known["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
-        self.weights = {name: weight for name, weight in weights.items() if weight}
-        self._terms = {name: known[name] for name in self.weights if name in known}
-
-    def __call__(self, predicted: Frames, truth: Frames, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
+    def __call__(self, predicted: Maps, truth: Maps, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
         """Return the terms by name, before their weights; all are 0 if no frame has a valid pixel."""
-        a, b, known = known_frames(predicted, truth, valid)
-        if not len(a):
-            return {name: 0 * predicted.sum() for name in self._terms}
-        return {name: term(a, b, known).mean() for name, term in self._terms.items()}
+        return {name: term(predicted, truth, valid) for name, term in self._terms.items()}
 
     def total(self, terms: Mapping[str, Float[Tensor, ""]]) -> Float[Tensor, ""]:
         """Return the weighted sum of the terms."""
         return torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
 
 
-class PolarizationLoss(FrameLoss):
-    """A `FrameLoss` of DoLP, plus a term for (s1, s2) if the network predicts them.
+def frame_terms(
+    weights: Mapping[str, float], lpips: Lpips | None, index: int | None = None
+) -> dict[str, tuple[float, Term]]:
+    """Terms mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips of the map `index`, each a mean over all frames.
+
+    `index` is None for frames without an axis of maps. Invalid pixels (see `polarnet.metrics.similarity`) and frames
+    without a valid pixel count in no term. ValueError if LPIPS has a weight but `lpips` is None.
+    """
+    if lpips is None and weights.get("lpips", 0) > 0:
+        raise ValueError(f"lpips: its weight is {weights['lpips']}, but there is no LPIPS network; load one")
+    scores: dict[str, Callable[[Tensor, Tensor, Tensor | None], Tensor]] = {
+        "mse": mse,
+        "mae": lambda a, b, valid: (a - b).abs() if valid is None else mean_where((a - b).abs(), valid),
+        "ssim_loss": lambda a, b, valid: 1 - ssim(a, b, valid),
+    }
+    if lpips is not None:
+        scores["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
+
+    def term(name: str, predicted: Maps, truth: Maps, valid: Valid) -> Float[Tensor, ""]:
+        frames = (predicted, truth) if index is None else (predicted[:, :, index], truth[:, :, index])
+        a, b, known = known_frames(*frames, valid)
+        return scores[name](a, b, known).mean() if len(a) else 0 * predicted.sum()
+
+    return {name: (weight, partial(term, name)) for name, weight in weights.items() if name in scores}
+
+
+def polarization_loss(config: LossConfig, lpips: Lpips | None, *, dolp_only: bool) -> Loss:
+    """Loss of the maps DoLP, s1 and s2, or of predictions of DoLP alone.
 
     With `config.half_weight`, the terms `mse` and `stokes` are replaced by `relative_mse` and `relative_stokes`.
     """
 
-    def __init__(self, config: LossConfig, lpips: Lpips | None, *, dolp_only: bool):
-        self._half_weight, prefix = config.half_weight, "" if config.half_weight is None else "relative_"
-        weights = {f"{prefix}mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}
-        super().__init__(weights | ({} if dolp_only else {f"{prefix}stokes": config.stokes}), lpips)
+    def squared_errors(maps: slice, predicted: Maps, truth: Maps, valid: Valid) -> Float[Tensor, ""]:
+        errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
+        errors = errors * frame_weights(truth[:, :, 0], valid, config.half_weight)[..., None, None]
+        if valid is None:
+            return errors.flatten().mean()
+        return errors[valid].mean() if valid.any() else 0 * errors.sum()
 
-    def __call__(
-        self, predicted: Float[Tensor, "t b k h w"], truth: Float[Tensor, "t b m h w"], valid: Valid = None
-    ) -> dict[str, Float[Tensor, ""]]:
-        """Return the unweighted terms by name, in the order of `weights`.
-
-        The maps are DoLP, s1 and s2; `predicted` may be DoLP alone.
-        """
-        terms = super().__call__(predicted[:, :, 0], truth[:, :, 0], valid)
-        for name in [name for name in self.weights if name not in terms]:
-            maps = slice(0, 1) if name == "relative_mse" else slice(1, None)
-            errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
-            terms[name] = _mean_of_known(errors * self._weight_of(truth[:, :, 0], valid)[..., None, None], valid)
-        return {name: terms[name] for name in self.weights}
-
-    def _weight_of(self, dolp: Frames, valid: Valid) -> Float[Tensor, "t b"]:
-        """Weight of each frame: 1 if it is unpolarized, and less the higher its mean squared DoLP."""
-        if self._half_weight is None:
-            return torch.ones_like(dolp[..., 0, 0])
-        level = mean_where(dolp.square(), valid).nan_to_num(0.0)  # NaN: no valid pixel
-        return self._half_weight / (self._half_weight + level)
+    terms = frame_terms({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips, index=0)
+    stokes = (0.0 if dolp_only else config.stokes, partial(squared_errors, slice(1, None)))
+    if config.half_weight is None:
+        return Loss(terms | {"stokes": stokes})
+    del terms["mse"]
+    relative_mse = (config.mse, partial(squared_errors, slice(0, 1)))
+    return Loss({"relative_mse": relative_mse} | terms | {"relative_stokes": stokes})
 
 
-def _mean_of_known(of_pixels: Frames, valid: Valid) -> Float[Tensor, ""]:
-    """Mean over the valid pixels; 0 if there is none."""
-    if valid is None:
-        return of_pixels.flatten().mean()
-    return of_pixels[valid].mean() if valid.any() else 0 * of_pixels.sum()
+def frame_weights(dolp: Frames, valid: Valid, half_weight: float | None) -> Float[Tensor, "t b"]:
+    """Weight of each frame: 1 if it is unpolarized, and less the higher its mean squared DoLP; None: 1 for all."""
+    if half_weight is None:
+        return torch.ones_like(dolp[..., 0, 0])
+    level = mean_where(dolp.square(), valid).nan_to_num(0.0)  # NaN: no valid pixel
+    return half_weight / (half_weight + level)

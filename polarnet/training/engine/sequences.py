@@ -26,24 +26,24 @@ MEMORY_SHARE = 0.7  # share of the free memory that the sequences of a training 
 EIGHTH_TURN = math.pi / 4  # angle between neighbouring polarizers
 
 
-class WindowSequence(NamedTuple):
-    """All windows of a sequence, with the truth at the end of each."""
+class Windows(NamedTuple):
+    """Windows of one sequence, or with an axis b those of a batch, with the truth at the end of each."""
 
-    name: str
-    inputs: Float[Tensor, "t c h w"] | Int8[Tensor, "t c h w"]
+    names: list[str]
+    inputs: Float[Tensor, "t *b c h w"] | Int8[Tensor, "t *b c h w"]
     """Channel by channel (0, 45, 90, 135 degrees); c is 4 times the images per channel of the representation.
 
     int8 only in the memory of a training, where that is exact.
     """
-    dolp: Float[Tensor, "t h w"]
-    aolp: Float[Tensor, "t h w"]
-    intensity: Float[Tensor, "t 4 h w"]
+    dolp: Float[Tensor, "t *b h w"]
+    aolp: Float[Tensor, "t *b h w"]
+    intensity: Float[Tensor, "t *b 4 h w"]
     """Empty (t = 0) in the memory of a training that does not need intensities."""
-    valid: Bool[Tensor, "t h w"] | None = None
+    valid: Bool[Tensor, "t *b h w"] | None = None
     """Where the truth is known; None: everywhere."""
 
 
-class WindowDataset(Dataset[WindowSequence]):
+class WindowDataset(Dataset[Windows]):
     """Item i holds all windows of sequence i, encoded on access. Frames give the windows' ends and the truth."""
 
     def __init__(self, events: EventStore, frames: FrameStore, sequences: list[str], encode: Encode):
@@ -59,24 +59,12 @@ class WindowDataset(Dataset[WindowSequence]):
     def __len__(self) -> int:
         return len(self.sequences)
 
-    def __getitem__(self, i: int) -> WindowSequence:
+    def __getitem__(self, i: int) -> Windows:
         name = self.sequences[i]
         t_us, intensity, dolp, aolp, valid = self.frames.frames(name)
         inputs = encode_windows(self.events.read(name), t_us, self.encode)
         known = None if valid is None else valid[1:]
-        return WindowSequence(name, inputs, dolp[1:], aolp[1:], intensity[1:], known)
-
-
-class Batch(NamedTuple):
-    """b sequences of t windows each. The c input channels are ordered polarizer by polarizer."""
-
-    names: list[str]
-    inputs: Float[Tensor, "t b c h w"]
-    dolp: Float[Tensor, "t b h w"]
-    aolp: Float[Tensor, "t b h w"]
-    intensity: Float[Tensor, "t b 4 h w"]
-    valid: Bool[Tensor, "t b h w"] | None = None
-    """Pixels whose truth is known; None: all."""
+        return Windows([name], inputs, dolp[1:], aolp[1:], intensity[1:], known)
 
 
 class View(NamedTuple):
@@ -95,7 +83,7 @@ class View(NamedTuple):
     direction: int
 
 
-def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
+def apply_view(sequence: Windows, view: View) -> Windows:
     """Crop, mirror and renumber a sequence. The four channels and their truth stay exact."""
 
     def cropped(frames: Tensor) -> Tensor:
@@ -106,7 +94,7 @@ def apply_view(sequence: WindowSequence, view: View) -> WindowSequence:
     aolp = torch.remainder(view.direction * (cropped(sequence.aolp) - view.turn * EIGHTH_TURN), math.pi)
     valid = None if sequence.valid is None else cropped(sequence.valid)
     intensity = cropped(sequence.intensity)[:, polarizers]
-    return WindowSequence(sequence.name, inputs, cropped(sequence.dolp), aolp, intensity, valid)
+    return Windows(sequence.names, inputs, cropped(sequence.dolp), aolp, intensity, valid)
 
 
 @section
@@ -142,24 +130,29 @@ def random_view(count: int, height: int, width: int, config: ViewConfig, generat
     return View(*cut, mirrored, turn, -1 if reverse else 1)
 
 
-class Visits(Dataset[WindowSequence]):
+class Visits(Dataset[Windows]):
     """All visits of one epoch. Seed, epoch, sequence name and visit number determine the view of each visit."""
 
-    def __init__(self, sequences: WindowDataset | list[WindowSequence], config: ViewConfig, seed: int, epoch: int):
+    def __init__(self, sequences: WindowDataset | list[Windows], config: ViewConfig, seed: int, epoch: int):
         self.sequences, self.config, self.seed, self.epoch = sequences, config, seed, epoch
 
     def __len__(self) -> int:
         return self.config.visits * len(self.sequences)
 
-    def __getitem__(self, index: int) -> WindowSequence:
+    def order(self) -> list[int]:
+        """Return the random order of the visits."""
+        generator = generator_for(self.seed, "all sequences", f"order of epoch {self.epoch}")
+        return generator.permutation(len(self)).tolist()
+
+    def __getitem__(self, index: int) -> Windows:
         visit, number = divmod(index, len(self.sequences))
         sequence = self.sequences[number]
         count, height, width = sequence.dolp.shape
-        generator = generator_for(self.seed, sequence.name, f"visit {visit} in epoch {self.epoch}")
+        generator = generator_for(self.seed, sequence.names[0], f"visit {visit} in epoch {self.epoch}")
         return apply_view(sequence, random_view(count, height, width, self.config, generator))
 
 
-def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> list[WindowSequence] | None:
+def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> list[Windows] | None:
     """A dataset's encoded sequences, if they fit into `MEMORY_SHARE` of the free memory; None if they do not.
 
     `workers` processes read and encode them; 0 or 1: this process. `intensity` says whether to keep the intensity.
@@ -175,10 +168,10 @@ def loaded_if_it_fits(dataset: WindowDataset, intensity: bool, workers: int) -> 
         return field.clone() if workers and field is not None else field
 
     with memory_handed_back():
-        return [WindowSequence(name, *map(own, fields)) for name, *fields in loader]  # type: ignore[arg-type]
+        return [Windows(names, *map(own, fields)) for names, *fields in loader]  # type: ignore[arg-type]
 
 
-def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
+def packed(sequence: Windows, intensity: bool) -> Windows:
     """Store the inputs as int8 if that is exact, as for most event counts; drop the intensity unless `intensity`."""
     if not intensity:
         sequence = sequence._replace(intensity=sequence.intensity[:0].clone())
@@ -186,7 +179,7 @@ def packed(sequence: WindowSequence, intensity: bool) -> WindowSequence:
     return sequence._replace(inputs=small) if torch.equal(small.float(), sequence.inputs) else sequence
 
 
-def stack(sequences: Sequence[WindowSequence]) -> Batch:
+def stack(sequences: Sequence[Windows]) -> Windows:
     """Stack sequences into a batch; ValueError if their numbers of windows differ."""
     lengths = {len(sequence.dolp) for sequence in sequences}
     if len(lengths) > 1:
@@ -194,16 +187,9 @@ def stack(sequences: Sequence[WindowSequence]) -> Batch:
     names, *columns, masks = zip(*sequences, strict=True)
     valid = None if masks[0] is None else torch.stack(masks, dim=1)  # one store: masks for all or none
     inputs, dolp, aolp, intensity = (torch.stack(column, dim=1) for column in columns)
-    return Batch(list(names), inputs, dolp, aolp, intensity, valid)
+    return Windows([name for (name,) in names], inputs, dolp, aolp, intensity, valid)
 
 
-def shuffled(count: int, seed: int, epoch: int) -> list[int]:
-    """Return a random order of `count` visits for an epoch."""
-    return generator_for(seed, "all sequences", f"order of epoch {epoch}").permutation(count).tolist()
-
-
-def batches_of(
-    dataset: Dataset[WindowSequence], order: Sequence[int], batch_size: int, workers: int
-) -> Iterator[Batch]:
+def batches_of(dataset: Dataset[Windows], order: Sequence[int], batch_size: int, workers: int) -> Iterator[Windows]:
     """Yield batches of the sequences in `order`; the last batch may be smaller. Workers, if any, read ahead."""
     return iter(DataLoader(dataset, batch_size, sampler=order, collate_fn=stack, num_workers=workers))

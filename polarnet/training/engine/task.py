@@ -16,8 +16,8 @@ from polarnet.runtime.files import sha256
 from polarnet.runtime.machine import precision_on, seed_for
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
-from polarnet.training.engine.losses import FrameLoss
-from polarnet.training.engine.sequences import Batch, WindowDataset
+from polarnet.training.engine.losses import Loss
+from polarnet.training.engine.sequences import WindowDataset, Windows
 
 State = list[Tensor] | None
 Network = TypeVar("Network", bound=nn.Module)
@@ -28,15 +28,16 @@ class Task:
     """The network-specific parts of a training."""
 
     network: nn.Module
+    """One with a module `expected` predicts DoLP, and its error from features (`unroll_with_features`)."""
     encode: Encode
     """Function that turns one channel's events in a window into the network's input."""
     streams: Callable[
-        [Batch], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
+        [Windows], tuple[Float[Tensor, "t b c h w"], Float[Tensor, "t b *k h w"], Bool[Tensor, "t b h w"] | None]
     ]
     """Function from a batch to the network's input, the truth, and the mask of known truth (None: all known)."""
     unroll: Callable[[Tensor, State], tuple[Float[Tensor, "t b *k h w"], State]]
     """Function from consecutive windows and a state to k predicted maps (or one, without the axis) and a state."""
-    loss: FrameLoss
+    loss: Loss
     description: Mapping[str, Any]
     """Metadata of the network and its input for checkpoints: at least "network", "config" and "in_channels"."""
     wants_intensity: bool = True
@@ -45,11 +46,6 @@ class Task:
     """A key of OPTIMIZERS."""
     scored: Callable[[Tensor], Float[Tensor, "t b h w"]] = lambda frames: frames
     """Function that picks the map to score from predicted or true maps; its validation MSE selects the best epoch."""
-    unroll_with_features: (
-        Callable[[Tensor, State], tuple[Float[Tensor, "t b h w"], Float[Tensor, "n c i j"], State]] | None
-    ) = None
-    """Same as `unroll`, but with the `scored` map alone and, at half resolution, features of its expected error. None:
-    the network expects no error. A network with this function has a method `expect(weight, bias)`."""
     scene_dolp: Sequence[float] | None = None
     """Median and 90th percentile of the mean DoLP of real scenes, for which the expected errors are fitted, too. None:
     they are fitted to the training pictures alone."""
@@ -59,10 +55,8 @@ class Task:
 class Baseline:
     """Record of a baseline that the pipeline trains; its module in polarnet.training holds it as `BASELINE`."""
 
-    name: str
-    """Section of `baselines` in params.yaml, and folder below data/train."""
     config: type
-    """Class of that section."""
+    """Class of its section of `baselines` in params.yaml."""
     task: Callable[[Any, Lpips | None, int], Task]
     """Section, LPIPS and seed -> the task of a new network."""
     lpips: tuple[str, ...]

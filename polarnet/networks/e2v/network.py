@@ -1,10 +1,13 @@
-"""E2VID: intensity from events, with 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021).
+"""Networks of the E2V baseline, from events to intensity: E2VID and FireNet.
 
-`E2vid.load` reads the authors' "lightweight" checkpoint, E2VID_lightweight.pth.tar.
+E2VID has 10,712,098 parameters (Rebecq et al., CVPR 2019 and TPAMI 2021), FireNet 37,777 (Scheerlinck et al., WACV
+2020). `E2vid.load` reads the authors' "lightweight" checkpoint, E2VID_lightweight.pth.tar; `FireNet.load` those of
+FireNet and of FireNet+ (Stoffregen et al., ECCV 2020).
 """
 
 import itertools
 import math
+import re
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -14,13 +17,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from polarnet.networks.base.published import PublishedNetwork
+from polarnet.networks.base.published import ConvGRU, PublishedNetwork, ResidualBlock
 
 HEAD_CHANNELS = 32
 ENCODER_CHANNELS = (64, 128, 256)
 RESIDUAL_BLOCKS = 2
 Padding = Literal["zeros", "reflect"]
 SIZE_MULTIPLE = 2 ** len(ENCODER_CHANNELS)  # each encoder halves height and width
+FIRENET_CHANNELS = 16
+MIDDLE_INTENSITY = 0.25  # initial bias of FireNet's output: a polarizer passes half of S0 = 0.5
+FIRENET_NAMES = {
+    "head.conv.conv2d": "head.conv2d",
+    "head.recurrent_block": "G1",
+    "resblocks.0.conv": "R1",
+    "resblocks.0.recurrent_block": "G2",
+    "resblocks.1": "R2",
+}
+"""Our names of FireNet's layers by those of its file, which are those of E2VID's code."""
 
 
 class E2vid(PublishedNetwork):
@@ -42,7 +55,7 @@ class E2vid(PublishedNetwork):
             Recurrent(convolution(inputs, outputs, 5, stride=2, normalised=True, relu=True), outputs)
             for inputs, outputs in steps
         )
-        self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1]) for _ in range(RESIDUAL_BLOCKS))
+        self.resblocks = nn.ModuleList(ResidualBlock(sizes[-1], normalised=True) for _ in range(RESIDUAL_BLOCKS))
         self.decoders = nn.ModuleList(decoder(inputs, outputs) for outputs, inputs in reversed(steps))
         self.pred = convolution(HEAD_CHANNELS, 1, 1, normalised=True)
 
@@ -69,6 +82,43 @@ class E2vid(PublishedNetwork):
     def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Remove the authors' prefix."""
         return {name.removeprefix("unetrecurrent."): tensor for name, tensor in tensors.items()}
+
+
+class FireNet(PublishedNetwork):
+    """conv - ConvGRU - residual - ConvGRU - residual - 1x1 conv at full resolution, without output activation.
+
+    The input is a voxel grid of one channel, normalised by `normalise_nonzero` for FireNet, unnormalised for FireNet+.
+    """
+
+    label = "FireNet"
+    first_layer = "head.conv2d.weight"
+
+    def __init__(self, bins: int):
+        super().__init__(bins)
+        self.head = convolution(bins, FIRENET_CHANNELS, 3, relu=True)
+        self.G1 = ConvGRU(FIRENET_CHANNELS)
+        self.R1 = ResidualBlock(FIRENET_CHANNELS)
+        self.G2 = ConvGRU(FIRENET_CHANNELS)
+        self.R2 = ResidualBlock(FIRENET_CHANNELS)
+        self.pred = convolution(FIRENET_CHANNELS, 1, 1)
+        nn.init.constant_(self.pred.get_parameter("conv2d.bias"), MIDDLE_INTENSITY)
+
+    def forward(
+        self, voxels: Float[Tensor, "b bins h w"], state: list[Tensor] | None = None
+    ) -> tuple[Float[Tensor, "b h w"], list[Tensor]]:
+        """Return the unclamped intensity at the end of one window, and the next state; `state` is None at the start."""
+        before1, before2 = state or (None, None)
+        after1 = self.G1(self.head(voxels.contiguous(memory_format=torch.channels_last)), before1)
+        after2 = self.G2(self.R1(after1), before2)
+        intensity = self.pred(self.R2(after2))
+        return intensity[:, 0].float(), [after1, after2]
+
+    @classmethod
+    def own_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Rename FireNet's tensors, named after the blocks of E2VID's code; FireNet+ uses our names."""
+        theirs = re.compile("|".join(map(re.escape, FIRENET_NAMES)))
+        plain = {name.removeprefix("net."): tensor for name, tensor in tensors.items()}
+        return {theirs.sub(lambda match: FIRENET_NAMES[match[0]], name): tensor for name, tensor in plain.items()}
 
 
 def convolution(
@@ -127,23 +177,12 @@ class ConvLstm(nn.Module):
         return torch.sigmoid(o) * torch.tanh(memory), memory
 
 
-class ResidualBlock(nn.Module):
-    """Residual block relu(x + bn(conv(relu(bn(conv(x))))))."""
-
-    def __init__(self, channels: int):
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn1 = nn.BatchNorm2d(channels)
-        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.bn2 = nn.BatchNorm2d(channels)
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return a tensor of the same shape."""
-        return F.relu(x + self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
-
-
 def reflected(images: Float[Tensor, "b c h w"]) -> tuple[int, int, Float[Tensor, "b c i j"]]:
     """Pad images by reflection to multiples of 8; return the rows added above, columns added left, and images."""
     rows, columns = (-side % SIZE_MULTIPLE for side in images.shape[-2:])
     top, left = math.ceil(rows / 2), math.ceil(columns / 2)
     return top, left, F.pad(images, (left, columns - left, top, rows - top), mode="reflect")
+
+
+ARCHITECTURES: dict[str, type[FireNet] | type[E2vid]] = {"firenet": FireNet, "e2vid": E2vid}
+"""Networks by name: `baselines.e2v.arch` selects one, and its checkpoint names it."""
