@@ -1,10 +1,11 @@
 """Clips: the frames of a video or of a folder, in colour or behind polarizers, one after another in constant memory."""
 
-import functools
 import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,7 +51,7 @@ class ClipOptions:
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames in the order of time. `frames` starts from the first frame at each call."""
+    """Frames in the order of time."""
 
     name: str
     words: str  # kind of the frames, for messages
@@ -58,7 +59,13 @@ class Clip:
     count: int | None  # number of frames; None: not known before the end
     still: bool  # whether the clip is a single picture or measurement; False for a video of one frame
     light: bool  # whether the RGB values are linear light in place of sRGB code values
-    frames: Callable[[], Iterator[ClipFrame]]
+    options: ClipOptions
+    levels: Callable[[], Iterator[tuple[str, Levels, float | None]]]
+    """Iterates from the first frame over name, code values and time (microseconds; None: unknown) of each frame."""
+
+    def frames(self) -> Iterator[ClipFrame]:
+        """Iterate from the first frame at each call; UnreadablePicture as `open_clip` says."""
+        return _measured(self) if self.measured else _coloured(self)
 
 
 def open_clip(path: Path, options: ClipOptions) -> Clip:
@@ -75,19 +82,12 @@ def open_clip(path: Path, options: ClipOptions) -> Clip:
         return _open_folder(path, path.resolve().name, options)
     if extension(path) not in VIDEOS:
         return _open_files([(path,)], path.stem, options)
-    if options.mosaic is not None:
-        return _measured(path.stem, "raw mosaics", _from_video(path), options)
-    return _coloured(path.stem, "video", _from_video(path, colour=True), options)
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Source of the code values ("levels") of a clip's frames."""
-
-    count: int | None
-    still: bool
-    levels: Callable[[], Iterator[tuple[str, Levels, float | None]]]
-    """Iterates from the first frame over name, code values and time (microseconds; None: unknown) of each frame."""
+    capture = _capture(path)
+    stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    capture.release()
+    count, measured = stated if stated > 0 else None, options.mosaic is not None
+    words = "raw mosaics" if measured else _coloured_words("video", options)
+    return Clip(path.stem, words, measured, count, False, False, options, partial(_from_video, path, not measured))
 
 
 def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
@@ -102,24 +102,32 @@ def _open_folder(folder: Path, name: str, options: ClipOptions) -> Clip:
 
 
 def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOptions) -> Clip:
-    measured = extension(groups[0][0]) == "npz" or len(groups[0]) > 1
-    if not measured and options.mosaic is None:
-        white = None if len(groups) == 1 else 1.0
-        files, light = _from_files(groups, functools.partial(_rgb, white=white)), images.holds_light(groups[0][0])
-        return _coloured(name, "photograph" if len(groups) == 1 else "frames", files, options, light)
-    kind, read = ("four polarizers", polarimetry.read_levels) if measured else ("raw mosaics", polarimetry.read_raw)
-    return _measured(name, kind, _from_files(groups, read), options)
+    measured, still, light = extension(groups[0][0]) == "npz" or len(groups[0]) > 1, len(groups) == 1, False
+    read: Callable[[tuple[Path, ...]], Levels]
+    if measured:
+        words, read = "four polarizers", polarimetry.read_levels
+    elif options.mosaic is not None:
+        words, read, measured = "raw mosaics", polarimetry.read_raw, True
+    else:
+        words = _coloured_words("photograph" if still else "frames", options)
+        read = partial(_rgb, white=None if still else 1.0)
+        with suppress(UnreadablePicture):  # raised again with the first frame
+            light = images.read_picture(groups[0][0], grey=True).light
+    return Clip(name, words, measured, len(groups), still, light, options, partial(_from_files, groups, read))
 
 
-def _from_files(groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, ...]], Levels]) -> _Files:
-    def levels() -> Iterator[tuple[str, Levels, float | None]]:
-        for group in groups:
-            try:
-                yield group[0].name, read(group), None
-            except UnreadablePicture as error:
-                raise UnreadablePicture(f"{group[0].name}: {error}") from error
+def _coloured_words(kind: str, options: ClipOptions) -> str:
+    return f"{'grey' if options.grey else 'RGB'} {kind}"
 
-    return _Files(len(groups), len(groups) == 1, levels)
+
+def _from_files(
+    groups: Sequence[tuple[Path, ...]], read: Callable[[tuple[Path, ...]], Levels]
+) -> Iterator[tuple[str, Levels, None]]:
+    for group in groups:
+        try:
+            yield group[0].name, read(group), None
+        except UnreadablePicture as error:
+            raise UnreadablePicture(f"{group[0].name}: {error}") from error
 
 
 def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3 h w"]:
@@ -130,32 +138,25 @@ def _rgb(paths: tuple[Path, ...], white: float | None) -> Float32[np.ndarray, "3
     return images.srgb_of(code_fractions(picture.pixels), picture).transpose(2, 0, 1)
 
 
-def _from_video(path: Path, colour: bool = False) -> _Files:
+def _from_video(path: Path, colour: bool) -> Iterator[tuple[str, Levels, float]]:
     """Frames of a video: RGB in [0, 1] if `colour`, else green 8-bit levels."""
-    capture = _capture(path)
-    stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    capture.release()
-
-    def levels() -> Iterator[tuple[str, Levels, float | None]]:
-        opened = _capture(path)
-        try:
-            for number in itertools.count():
-                there, pixels = opened.read()
-                if not there:
-                    break
-                if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
-                    raise UnreadablePicture(
-                        f"{path.name}: expected frames of 3 x 8 bits, got {pixels.dtype} {pixels.shape}"
-                    )
-                t_us = 1000 * opened.get(cv2.CAP_PROP_POS_MSEC)
-                planes = code_fractions(pixels[..., ::-1].transpose(2, 0, 1)) if colour else pixels[None, ..., GREEN]
-                yield f"frame {number}", planes, t_us
-        finally:
-            opened.release()
-        if number == 0:
-            raise UnreadablePicture(f"{path.name}: no frame of it can be read; convert it to MP4 or PNG files")
-
-    return _Files(stated if stated > 0 else None, False, levels)
+    opened = _capture(path)
+    try:
+        for number in itertools.count():
+            there, pixels = opened.read()
+            if not there:
+                break
+            if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8:
+                raise UnreadablePicture(
+                    f"{path.name}: expected frames of 3 x 8 bits, got {pixels.dtype} {pixels.shape}"
+                )
+            t_us = 1000 * opened.get(cv2.CAP_PROP_POS_MSEC)
+            planes = code_fractions(pixels[..., ::-1].transpose(2, 0, 1)) if colour else pixels[None, ..., GREEN]
+            yield f"frame {number}", planes, t_us
+    finally:
+        opened.release()
+    if number == 0:
+        raise UnreadablePicture(f"{path.name}: no frame of it can be read; convert it to MP4 or PNG files")
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
@@ -165,41 +166,35 @@ def _capture(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def _coloured(name: str, kind: str, files: _Files, options: ClipOptions, light: bool = False) -> Clip:
-    def frames() -> Iterator[ClipFrame]:
-        for rgb, t_us in _of_one_size(files):
-            pixels = np.ascontiguousarray(rgb.transpose(1, 2, 0))
-            if options.grey:
-                pixels = np.repeat(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
-            yield ClipFrame(_scaled(pixels, options.size), t_us, 0.0)
-
-    return Clip(name, f"{'grey' if options.grey else 'RGB'} {kind}", False, files.count, files.still, light, frames)
+def _coloured(clip: Clip) -> Iterator[ClipFrame]:
+    for rgb, t_us in _of_one_size(clip):
+        pixels = np.ascontiguousarray(rgb.transpose(1, 2, 0))
+        if clip.options.grey:
+            pixels = np.repeat(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
+        yield ClipFrame(_scaled(pixels, clip.options.size), t_us, 0.0)
 
 
-def _measured(name: str, words: str, files: _Files, options: ClipOptions) -> Clip:
-    def frames() -> Iterator[ClipFrame]:
-        white = options.white
-        for number, (levels, t_us) in enumerate(_of_one_size(files)):
-            try:
-                white = polarimetry.white_level(levels, white)
-            except UnreadablePicture as error:
-                raise UnreadablePicture(f"frame {number}: {error}") from None
-            height, width = levels.shape[1:]
-            if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
-                raise UnreadablePicture(
-                    f"--mosaic: expected frames of even height and width, {MIN_MOSAIC_SIDE} px or more, for whole 2x2 "
-                    f"cells, got {height}x{width}; cut them without shifting the cells"
-                )
-            values, saturated = polarimetry.levels_at_angles(levels, white, options.mosaic)
-            pixels = polarimetry.without_saturation(values, saturated).astype(np.float32).transpose(1, 2, 0)
-            yield ClipFrame(_scaled(np.ascontiguousarray(pixels), options.size), t_us, float(saturated.any(0).mean()))
-
-    return Clip(name, words, True, files.count, files.still, False, frames)
+def _measured(clip: Clip) -> Iterator[ClipFrame]:
+    white, options = clip.options.white, clip.options
+    for number, (levels, t_us) in enumerate(_of_one_size(clip)):
+        try:
+            white = polarimetry.white_level(levels, white)
+        except UnreadablePicture as error:
+            raise UnreadablePicture(f"frame {number}: {error}") from None
+        height, width = levels.shape[1:]
+        if len(levels) == 1 and (height % 2 or width % 2 or min(height, width) < MIN_MOSAIC_SIDE):
+            raise UnreadablePicture(
+                f"--mosaic: expected frames of even height and width, {MIN_MOSAIC_SIDE} px or more, for whole 2x2 "
+                f"cells, got {height}x{width}; cut them without shifting the cells"
+            )
+        values, saturated = polarimetry.levels_at_angles(levels, white, options.mosaic)
+        pixels = np.ascontiguousarray(values.astype(np.float32).transpose(1, 2, 0))
+        yield ClipFrame(_scaled(pixels, options.size), t_us, float(saturated.any(0).mean()))
 
 
-def _of_one_size(files: _Files) -> Iterator[tuple[Levels, float | None]]:
+def _of_one_size(clip: Clip) -> Iterator[tuple[Levels, float | None]]:
     shape, first = None, ""
-    for name, levels, t_us in files.levels():
+    for name, levels, t_us in clip.levels():
         if shape is None:
             shape, first = levels.shape, name
         if levels.shape != shape:

@@ -81,8 +81,6 @@ def read_picture(path: str | os.PathLike[str], grey: bool = False) -> Picture:
     """
     pixels, spec, file_format = _read(Path(path))
     light = _is_light(spec, file_format)
-    if not light:
-        _check_white(pixels)
     colours = [i for i in range(spec.nchannels) if i != spec.alpha_channel]
     if grey and len(colours) == 1:
         return Picture(np.repeat(pixels[..., colours], 3, axis=2), None, SRGB, light, None, None)
@@ -101,9 +99,7 @@ def read_picture(path: str | os.PathLike[str], grey: bool = False) -> Picture:
 
 def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
     """Code values of all channels except alpha, not turned by an orientation; raises as `read_picture` does."""
-    pixels, spec, file_format = _read(Path(path), as_stored=True)
-    if not _is_light(spec, file_format):
-        _check_white(pixels)
+    pixels, spec, _ = _read(Path(path), as_stored=True)
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
 
@@ -204,8 +200,7 @@ def read_rgb(path: str | os.PathLike[str]) -> Float[Tensor, "3 h w"]:
     """
     picture = read_picture(path)
     _check_white(picture.pixels)
-    rows, columns = picture.pixels.shape[:2]
-    rgb = srgb_of(fit(picture.pixels, rows, columns, 1.0), picture)
+    rgb = srgb_of(code_fractions(picture.pixels), picture)
     return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))
 
 
@@ -229,20 +224,6 @@ def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
             f"in {picture.colour_space or 'no known encoding'}; read_rgb reads other pictures"
         )
     return torch.from_numpy(np.ascontiguousarray(light_of(picture.pixels).transpose(2, 0, 1)))
-
-
-def holds_light(path: str | os.PathLike[str]) -> bool:
-    """Whether a file holds linear light in floating-point numbers, as OpenEXR and Radiance HDR files do.
-
-    Only its header is read; False for a file that cannot be opened.
-    """
-    try:
-        file = _opened(Path(path))
-    except UnreadablePicture:
-        return False
-    spec, file_format = file.spec(), file.format_name()
-    file.close()
-    return _is_light(spec, file_format)
 
 
 def light_of(pixels: Float32[np.ndarray, "h w 3"], white: float | None = None) -> Float32[np.ndarray, "h w 3"]:
@@ -275,8 +256,11 @@ def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w 
         file.close()
     if pixels is None or problem:
         raise UnreadablePicture(f"cannot be read: {_first_line(problem, path)}")
+    pixels, file_format = _plain(pixels), file.format_name()
+    if not _is_light(spec, file_format):
+        _check_white(pixels)
     orientation = 1 if as_stored else spec.get_int_attribute("Orientation", 1)
-    return upright(_plain(pixels), orientation), spec, file.format_name()
+    return upright(pixels, orientation), spec, file_format
 
 
 def _opened(path: Path) -> Any:

@@ -31,8 +31,6 @@ logger = logging.getLogger(__name__)
 EDGE_BYTES = 1 << 16  # bytes at a file's start and at its end, hashed to choose `limit` files without reading them all
 
 Mapper = Callable[..., Iterable[Any]]
-Read = tuple[str, Callable[[Path], None], dict[str, Any]]
-"""A picture's suffix in data/images, the function that writes it there, and fields of its `ManifestEntry`."""
 
 
 @section
@@ -193,30 +191,30 @@ def _convert(item: tuple[int, Source], config: IngestConfig, seed: int, folder: 
     """Read or generate one picture as `folder`/source-<number>, or return the reason why not."""
     number, source = item
     try:
-        suffix, write, about = _READERS[source.kind](source, config, seed)
+        about = _READERS[source.kind](source, folder / f"source-{number:08d}", config, seed)
     except UnreadablePicture as error:
         return Skipped(source.files[0].name if source.kind == "photograph" else source.origin, str(error))
-    file = f"source-{number:08d}{suffix}"
-    write(folder / file)
     given: dict[str, Any] = {"licence": source.licence, "author": source.author}
     size: dict[str, Any] = {"height": config.height, "width": config.width}
     name = f"{_slug(source.stem)}-{about['sha256'][:8]}"
-    return ManifestEntry(name=name, file=file, source=source.kind, origin=source.origin, **(given | size | about))
+    return ManifestEntry(name=name, source=source.kind, origin=source.origin, **(given | size | about))
 
 
-def _read_photograph(source: Source, config: IngestConfig, _seed: int) -> Read:
+def _read_photograph(source: Source, target: Path, config: IngestConfig, _seed: int) -> dict[str, Any]:
     """Cut and scale a picture. Linear light in floating-point numbers stays as it is, other pictures become sRGB."""
     picture = images.read_picture(source.files[0])
     pixels = images.light_of(picture.pixels) if picture.light else picture.pixels
     fitted = images.fit(pixels, config.height, config.width, config.max_upscale)
-    about = {"sha256": picture.sha256, "licence": source.licence or picture.licence,
-             "author": source.author or picture.author}  # fmt: skip
+    file = target.with_suffix(images.LIGHT if picture.light else ".png")
     if picture.light:
-        return images.LIGHT, functools.partial(np.save, arr=fitted), about
-    return ".png", functools.partial(write_png, rgb=images.srgb_of(fitted, picture), bits=picture.bits), about
+        np.save(file, fitted)
+    else:
+        write_png(file, images.srgb_of(fitted, picture), picture.bits)
+    return {"file": file.name, "sha256": picture.sha256, "licence": source.licence or picture.licence,
+            "author": source.author or picture.author}  # fmt: skip
 
 
-def _read_polarization(source: Source, config: IngestConfig, _seed: int) -> Read:
+def _read_polarization(source: Source, target: Path, config: IngestConfig, _seed: int) -> dict[str, Any]:
     """Check and shrink a measurement."""
     measured = polarimetry.read_measurement(source.files, *parse_raw_mosaic(config.mosaic), config.white)
     if measured.residual > config.residual_max:
@@ -225,25 +223,30 @@ def _read_polarization(source: Source, config: IngestConfig, _seed: int) -> Read
             f"ingest.residual_max={config.residual_max:g}; is an angle, linearity or ingest.mosaic wrong?"
         )
     shrunk = polarimetry.shrink(measured, config.height, config.width)
-    height, width = shrunk.valid.shape
-    return ".npz", functools.partial(polarimetry.write_intensities, measurement=shrunk), {
-        "sha256": sha256(measured.intensities.tobytes(), measured.valid.tobytes()), "height": height, "width": width,
-        "residual": round(measured.residual, 6), "saturated_fraction": round(measured.saturated, 6),
+    file, (height, width) = target.with_suffix(".npz"), shrunk.valid.shape
+    polarimetry.write_intensities(file, shrunk)
+    return {
+        "file": file.name, "sha256": sha256(measured.intensities.tobytes(), measured.valid.tobytes()),
+        "height": height, "width": width, "residual": round(measured.residual, 6),
+        "saturated_fraction": round(measured.saturated, 6),
         "masked_fraction": round(float(1 - shrunk.valid.mean()), 6),
     }  # fmt: skip
 
 
-def _generate_dead_leaves(source: Source, config: IngestConfig, seed: int) -> Read:
+def _generate_dead_leaves(source: Source, target: Path, config: IngestConfig, seed: int) -> dict[str, Any]:
     rgb = dead_leaves(generator_for(seed, source.stem, "picture"), config.height, config.width)
     digest = sha256(np.round(rgb * 255).astype(np.uint8).tobytes())
-    return ".png", functools.partial(write_png, rgb=rgb, bits=8), {"sha256": digest}
+    write_png(target.with_suffix(".png"), rgb, bits=8)
+    return {"file": f"{target.name}.png", "sha256": digest}
 
 
-_READERS: dict[str, Callable[[Source, IngestConfig, int], Read]] = {
+_READERS: dict[str, Callable[[Source, Path, IngestConfig, int], dict[str, Any]]] = {
     "photograph": _read_photograph, "dead_leaves": _generate_dead_leaves, "folder": _read_photograph,
     "polarization": _read_polarization,
 }  # fmt: skip
-"""Readers by kind of source, in the order in which the kinds are split."""
+"""Readers by kind of source, in the order in which the kinds are split.
+
+Each writes a picture to a path, with a suffix for its kind, and returns fields of its `ManifestEntry`."""
 
 
 def _without_duplicates(outcomes: list[ManifestEntry | Skipped]) -> tuple[list[ManifestEntry], list[Skipped]]:

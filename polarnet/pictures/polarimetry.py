@@ -94,8 +94,7 @@ def read_measurement(
     if not trusted.any():
         raise UnreadablePicture("no pixel is lit and unsaturated at all four angles")
     residual = float(np.median(np.abs(i0 + i90 - i45 - i135)[trusted] / total[trusted]))
-    intensities = without_saturation(values, saturated).astype(np.float32)
-    return Measurement(intensities, count <= 1, residual, saturated=float((count > 0).mean()))
+    return Measurement(values.astype(np.float32), count <= 1, residual, saturated=float((count > 0).mean()))
 
 
 def read_levels(paths: Sequence[Path]) -> Shaped[np.ndarray, "n h w"]:
@@ -111,23 +110,19 @@ def levels_at_angles(
 ) -> tuple[Float64[np.ndarray, "4 h2 w2"], Bool[np.ndarray, "4 h2 w2"]]:
     """Intensities at 0, 45, 90 and 135 degrees, and which of them saturate; S0 = I0 + I90 = 1 at I0 = I90 = `white`.
 
-    `levels` are those of four angles, or of one raw frame of a `mosaic`, which is demosaicked.
+    `levels` are those of four angles, or of one raw frame of a `mosaic`, which is demosaicked. If one angle of a pixel
+    saturates, its intensity is computed from the other three.
     """
     values = levels.astype(np.float64)
-    if len(values) == len(POLARIZER_ANGLES_DEG):
-        return values / (2 * white), values >= white
-    assert mosaic is not None
-    saturated = demosaic((values[0] >= white).astype(np.float64), mosaic, colours) > 0
-    return demosaic(values[0], mosaic, colours) / (2 * white), saturated
-
-
-def without_saturation(
-    values: Float64[np.ndarray, "4 h w"], saturated: Bool[np.ndarray, "4 h w"]
-) -> Float64[np.ndarray, "4 h w"]:
-    """Replace the saturated angle of a pixel by its value from the other three, if only one angle saturates."""
-    i0, i45, i90, i135 = values
+    saturated = values >= white
+    if len(values) != len(POLARIZER_ANGLES_DEG):
+        assert mosaic is not None
+        saturated = demosaic(saturated[0].astype(np.float64), mosaic, colours) > 0
+        values = demosaic(values[0], mosaic, colours)
+    i0, i45, i90, i135 = values = values / (2 * white)
     from_the_others = np.stack([i45 + i135 - i90, i0 + i90 - i135, i45 + i135 - i0, i0 + i90 - i45])
-    return np.where(saturated & (saturated.sum(axis=0) == 1), np.maximum(from_the_others, values), values)
+    alone = saturated & (saturated.sum(axis=0) == 1)
+    return np.where(alone, np.maximum(from_the_others, values), values), saturated
 
 
 def demosaic(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from polarnet.events.mosaic import places_of
-from polarnet.pictures.polarimetry import levels_at_angles, white_level, without_saturation
+from polarnet.pictures.polarimetry import levels_at_angles, white_level
 from polarnet.recordings.recording import FORMATS, detect_format
 from polarnet.recordings.source import CameraFrames, RecordingError
 from polarnet.stokes import (
@@ -96,7 +96,7 @@ def _demosaicked(frames: CameraFrames, mosaic: Mosaic) -> Truth:
     valid = torch.zeros(n, height, width, dtype=torch.bool)
     for k, frame in enumerate(levels):
         values, saturated = levels_at_angles(frame[None], white, mosaic)
-        intensity[k, :, 1:-1, 1:-1] = torch.from_numpy(without_saturation(values, saturated))
+        intensity[k, :, 1:-1, 1:-1] = torch.from_numpy(values)
         valid[k, 1:-1, 1:-1] = torch.from_numpy(saturated.sum(axis=0) <= 1)
     stokes = stokes_from_intensities(intensity)
     valid &= stokes[:, 0] > 0  # without light there is no polarization

@@ -19,49 +19,34 @@ from polarnet.runtime.compilation import forget_stale_code
 from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.simulation.pixels import esim, exact, v2e, voltmeter
-from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, Defects, defects_of, empty_columns
-from polarnet.simulation.pixels.light import FULL_SCALE, Light, light_of_frames
-from polarnet.simulation.pixels.physics import MAX_RATE_HZ, PixelConfig
+from polarnet.simulation.pixels.columns import MAX_STEP_US, MAX_TIME_US, Columns, Steps, defects_of, empty_columns
+from polarnet.simulation.pixels.light import FULL_SCALE, Light
+from polarnet.simulation.pixels.physics import MAX_RATE_HZ, PixelConfig, physics_of
 
 EVENTS_PER_PIXEL_AND_STEP = 0.5  # initial room, far more than usual: untouched pages cost no memory
 MAX_INITIAL_ROOM = 1 << 22  # events; columns grow where a scene is busier
 
 
-class Steps(NamedTuple):
-    """A span of time of one channel. Step k lasts from times_us[k] to times_us[k + 1] and ends with one frame."""
-
-    physics: Any  # parameters of the pixel model, as its `physics_of` returns them
-    height: int
-    width: int
-    times_us: np.ndarray  # float64 [steps + 1], strictly increasing
-    first_frame: int  # index into the light of the frame at times_us[1]
-    first_number: int  # steps that the channel has taken before; random draws are numbered by it
-    key: np.uint64  # seed of all noise of the sensor
-    channel: int  # each channel has its own mismatch and noise
-    defects: Defects
-
-
 class PixelModel(Protocol):
-    """A pixel model: a module of `polarnet.simulation.pixels`. `start` and `advance` are compiled kernels."""
+    """A pixel model: a module of `polarnet.simulation.pixels`."""
 
     EIGHT_BIT_VIDEO: bool  # whether the model sees whole digital numbers at regular times
-    OPTIONS: tuple[str, ...]  # the names in `OFF` that the model has
 
-    def physics_of(self, config: "EmulatorConfig") -> Any:
-        """The model's parameters as a NamedTuple."""
-
-    def initial(self, height: int, width: int, physics: Any, key: np.uint64, channel: int) -> Any:
-        """State of a channel's pixels before the first frame, mismatch included: a NamedTuple of arrays [h * w]."""
-
-    def start(self, light: Light, pixels: Any, steps: Steps) -> None:
-        """Adapt the pixels to the first frame, in place."""
+    def start(self, light: Light, steps: Steps) -> Any:
+        """A channel's pixels, mismatch included, adapted to the first frame: a NamedTuple of arrays [h * w]."""
 
     def advance(self, light: Light, pixels: Any, steps: Steps, columns: Columns) -> tuple[Columns, int]:
-        """Advance the pixels through the steps, in place; return the columns with the events, and their number."""
+        """Advance the pixels through the steps, in place; return the columns with the events, and their number.
+
+        A compiled kernel."""
 
 
-OFF = {"dark_dn": None, "photoreceptor_noise": 0.0, "refractory": "keep"}
-"""Values that switch off the parameters that only some models have; others refuse any other value."""
+PARTIAL: dict[str, tuple[Any, tuple[str, ...]]] = {
+    "dark_dn": (None, ("v2e", "exact")),
+    "photoreceptor_noise": (0.0, ("v2e", "exact")),
+    "refractory": ("keep", ("exact",)),
+}
+"""Parameters that only some models have: the value that switches one off, which others insist on, and its models."""
 LOGARITHMIC = "_hz"
 """Name suffix of the parameters whose logarithm is drawn uniformly: rates and bandwidths."""
 NAMES = ("model", "refractory")
@@ -73,8 +58,8 @@ MODELS: dict[str, PixelModel] = {"v2e": v2e, "exact": exact, "esim": esim, "dvs_
 class EmulatorConfig(PixelConfig):
     """Section `emulate` of params.yaml: the parameters of all pixel models, and which model is in use.
 
-    A model ignores the parameters that it does not have, and refuses those in `OFF`. Ranges in `randomise` are drawn
-    before (`Camera.drawn`).
+    A model ignores the parameters that it does not have, and refuses those in `PARTIAL`. Ranges in `randomise` are
+    drawn before (`Camera.drawn`).
 
     >>> from dataclasses import replace
     >>> from polarnet.simulation import SENSORS
@@ -98,8 +83,8 @@ class EmulatorConfig(PixelConfig):
     def __post_init__(self):
         super().__post_init__()
         _check_ranges(self)
-        for name, off in OFF.items():
-            value, having = getattr(self, name), [other for other, model in MODELS.items() if name in model.OPTIONS]
+        for name, (off, having) in PARTIAL.items():
+            value = getattr(self, name)
             if value != off and self.model not in having:
                 raise ValueError(
                     f"{name}: expected {off} with model {self.model}, got {value}; models with it: {', '.join(having)}"
@@ -114,23 +99,17 @@ def _check_ranges(config: EmulatorConfig) -> None:
     for name, values in ranges.items():
         if name not in drawable:
             raise ValueError(f"randomise.{name}: expected one of {', '.join(drawable)}, got {name!r}")
-        if name in NAMES and not values:
-            raise ValueError(f"randomise.{name}: expected at least one name, got {values}")
-        if name not in NAMES:
-            _check_bounds(name, values)
+        pair = len(values) == 2 and all(isinstance(value, float) for value in values) and values[0] <= values[1]
+        if not (values if name in NAMES else pair):
+            form = "at least one name" if name in NAMES else "[lowest, highest]"
+            raise ValueError(f"randomise.{name}: expected {form}, got {values}")
+        if name.endswith(LOGARITHMIC) and values[0] <= 0:
+            raise ValueError(f"randomise.{name}: expected a lowest value > 0, got {values}; the logarithm is drawn")
         for value in values:
             try:
                 replace(config, randomise=None, **{name: value})
             except ValueError as error:
                 raise ValueError(f"randomise.{error}") from None
-
-
-def _check_bounds(name: str, values: Sequence[float | str]) -> None:
-    numbers = [value for value in values if isinstance(value, float)]
-    if len(values) != 2 or numbers != values or numbers[0] > numbers[1]:
-        raise ValueError(f"randomise.{name}: expected [lowest, highest], got {values}")
-    if name.endswith(LOGARITHMIC) and numbers[0] <= 0:
-        raise ValueError(f"randomise.{name}: expected a lowest value > 0, got {values}; the logarithm is drawn")
 
 
 def draws(config: EmulatorConfig, seed: int, sequence: str) -> dict[str, Any]:
@@ -210,7 +189,7 @@ def emulate(
     times = np.asarray(t_us, dtype=np.float64)
     _check_frames(frames, times, state, config.model)
     clip = frames.numpy() if frames.dtype == torch.uint8 else frames.to(torch.float32).numpy()
-    lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in clip.swapaxes(0, 1)]
+    lights = [Light(np.ascontiguousarray(channel)) for channel in clip.swapaxes(0, 1)]
     height, width = clip.shape[2:]
     return emulate_lights(Channels(height, width, config, key), lights, times, state, threads)
 
@@ -229,7 +208,7 @@ def emulate_frames(
     for t_us, light in pieces:
         if MODELS[sensor.model].EIGHT_BIT_VIDEO and sensor.dark_dn is None:
             light = (light + np.float32(0.5)).astype(np.uint8)
-        lights = [light_of_frames(np.ascontiguousarray(channel)) for channel in light]
+        lights = [Light(np.ascontiguousarray(channel)) for channel in light]
         events, state = emulate_lights(channels, lights, t_us.astype(np.float64), state, threads)
         parts.append(events)
     assert state is not None  # there was at least one piece
@@ -247,7 +226,7 @@ def emulate_lights(
     forget_stale_code(Path(__file__).parent)
     height, width, config, key = channels
     model = MODELS[config.model]
-    physics, seed = model.physics_of(config), np.uint64(key % 2**64)
+    physics, seed = physics_of(config), np.uint64(key % 2**64)
     times = _checked_times(t_us if state is None else np.concatenate([[state.t_us], t_us]))
     first_frame, first_number = (1, 0) if state is None else (0, state.steps)
     room = 1 + int(min(MAX_INITIAL_ROOM, EVENTS_PER_PIXEL_AND_STEP * height * width * len(times)))
@@ -258,8 +237,7 @@ def emulate_lights(
         defects = defects_of(config.hot_pixel_share, config.hot_pixel_rate_hz, height * width, seed, i, model is v2e)
         steps = Steps(physics, height, width, times, first_frame, first_number, seed, i, defects)
         if state is None:
-            pixels = model.initial(height, width, physics, seed, i)
-            model.start(lights[i], pixels, steps)
+            pixels = model.start(lights[i], steps)
         else:
             pixels = type(state.pixels[i])(*(array.copy() for array in state.pixels[i]))
         columns, count = model.advance(lights[i], pixels, steps, empty[i])

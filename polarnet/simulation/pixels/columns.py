@@ -12,6 +12,7 @@ import numpy as np
 
 from polarnet.runtime.compilation import compiled, inlined
 from polarnet.simulation.pixels import randomness
+from polarnet.simulation.pixels.physics import Physics
 from polarnet.simulation.pixels.randomness import key_for, mixed, uniform
 
 TIME_SHIFT, ROW_SHIFT, COLUMN_SHIFT, PLACE_MASK = np.int64(31), np.int64(16), np.int64(1), np.int64(0x7FFF)
@@ -38,6 +39,20 @@ class Defects(NamedTuple):
     silent: np.ndarray  # bool [h * w], whether a pixel's own events are dropped; empty for a sensor without defects
     rate_hz: float
     round_up: bool  # whether the pixel model stamps an event after the start of its step and up to its end
+
+
+class Steps(NamedTuple):
+    """A span of time of one channel. Step k lasts from times_us[k] to times_us[k + 1] and ends with one frame."""
+
+    physics: Physics
+    height: int
+    width: int
+    times_us: np.ndarray  # float64 [steps + 1], strictly increasing
+    first_frame: int  # index into the light of the frame at times_us[1]
+    first_number: int  # steps that the channel has taken before; random draws are numbered by it
+    key: np.uint64  # seed of all noise of the sensor
+    channel: int  # each channel has its own mismatch and noise
+    defects: Defects
 
 
 def defects_of(share: float, rate_hz: float, pixels: int, key: np.uint64, channel: int, round_up: bool) -> Defects:
@@ -80,6 +95,13 @@ def roomier(pending):
 def place_of(y, x):
     """Bits of row and column in the integer that `event_of` makes of an event."""
     return np.int64(y) << ROW_SHIFT | np.int64(x) << COLUMN_SHIFT
+
+
+@inlined
+def pixel_place(pixel, width):
+    """`place_of` a pixel by its index; quicker than a division of whole numbers."""
+    y = np.int64((pixel + 0.5) / width)
+    return place_of(y, pixel - y * width)
 
 
 @inlined

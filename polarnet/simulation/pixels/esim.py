@@ -10,23 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.runtime.compilation import ZERO, compiled
-from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import FULL_SCALE, intensity_rows, ln
-from polarnet.simulation.pixels.physics import PixelConfig
+from polarnet.simulation.pixels.columns import Steps, event_of, pixel_place, roomier, write_in_order
+from polarnet.simulation.pixels.light import FULL_SCALE, Light, intensity_rows, ln
 
 EIGHT_BIT_VIDEO = False
-OPTIONS: tuple[str, ...] = ()
 NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
 NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test
-
-
-class Physics(NamedTuple):
-    """`PixelConfig` for compiled kernels."""
-
-    threshold_on: float
-    threshold_off: float
-    refractory_us: float
-    log_eps: float
 
 
 class Pixels(NamedTuple):
@@ -37,16 +26,12 @@ class Pixels(NamedTuple):
     last_event_us: np.ndarray  # float64
 
 
-def physics_of(config: PixelConfig) -> Physics:
-    """The parameters for the kernels."""
-    on, off = config.contrast_threshold_on, config.contrast_threshold_off
-    return Physics(on, off, config.refractory_period_us, config.esim_log_eps)
-
-
-def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """State of the pixels before the first frame: zeros, and no event yet."""
-    n = height * width
-    return Pixels(np.zeros(n, np.float32), np.zeros(n, np.float32), np.full(n, -np.inf))
+def start(light: Light, steps: Steps) -> Pixels:
+    """Pixels whose reference is the first frame; nothing has fired."""
+    n = steps.height * steps.width
+    dn, logarithm = np.empty((2, n), np.float32)
+    _respond(light, ZERO, steps, _table(steps.physics), dn, logarithm)
+    return Pixels(logarithm.copy(), logarithm, np.full(n, -np.inf))
 
 
 @compiled
@@ -55,63 +40,52 @@ def _table(physics):
     table = np.empty(256, np.float32)
     for dn in range(256):
         fraction = np.float32(np.float32(dn) / np.float32(FULL_SCALE))
-        table[dn] = math.log(np.float64(fraction + np.float32(physics.log_eps)))
+        table[dn] = math.log(np.float64(fraction + np.float32(physics.esim_log_eps)))
     return table
 
 
 @compiled
-def _respond(light, frame, steps, y, table, dn, logarithm):
-    intensity_rows(light, frame, y, steps.width, dn)
+def _respond(light, frame, steps, table, dn, logarithm):
+    intensity_rows(light, frame, ZERO, steps.width, dn)
     if light.images.itemsize == 1:
         for j in range(dn.size):
             logarithm[j] = table[np.int32(dn[j])]
     else:
         for j in range(dn.size):
-            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(steps.physics.log_eps))
-
-
-@compiled
-def start(light, pixels, steps):
-    """Set the reference to the first frame; nothing fires."""
-    dn, table = np.empty(pixels.logarithm.size, np.float32), _table(steps.physics)
-    _respond(light, ZERO, steps, ZERO, table, dn, pixels.logarithm)
-    pixels.reference[:] = pixels.logarithm
+            logarithm[j] = ln(dn[j] / np.float32(FULL_SCALE) + np.float32(steps.physics.esim_log_eps))
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    w, table, used = steps.width, _table(steps.physics), ZERO
-    dn, logarithm = np.empty((2, w), np.float32)
-    pending = np.empty(steps.height * w, np.int64)
+    table, used = _table(steps.physics), ZERO
+    dn, logarithm = np.empty((2, pixels.logarithm.size), np.float32)
+    pending = np.empty(dn.size, np.int64)
     for k in range(steps.times_us.size - 1):
-        n = ZERO
-        for y in range(steps.height):
-            _respond(light, steps.first_frame + k, steps, y, table, dn, logarithm)
-            pending, n = _fire(pixels, steps, k, y, logarithm, pending, n)
-            pixels.logarithm[y * w : (y + 1) * w] = logarithm
+        _respond(light, steps.first_frame + k, steps, table, dn, logarithm)
+        pending, n = _fire(pixels, steps, k, logarithm, pending)
+        pixels.logarithm[:] = logarithm
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 
 @compiled
-def _fire(pixels, steps, k, y, logarithm, pending, n):
-    """Append the events of row y in step k to the n pending ones; returns both."""
+def _fire(pixels, steps, k, logarithm, pending):
+    """Pending events of step k, and their number."""
     physics, start_us, stop_us = steps.physics, steps.times_us[k], steps.times_us[k + 1]
-    w, dt, base_us = logarithm.size, stop_us - start_us, math.floor(start_us)
-    for x in range(w):
-        i = y * w + x
-        before, after, reference = pixels.logarithm[i], logarithm[x], pixels.reference[i]
+    dt, base_us, n = stop_us - start_us, math.floor(start_us), ZERO
+    for i in range(logarithm.size):
+        before, after, reference = pixels.logarithm[i], logarithm[i], pixels.reference[i]
         change, on = np.float64(after) - np.float64(before), after >= before
         sign = np.float32(1 if on else -1)
         threshold = np.float32(physics.threshold_on if on else physics.threshold_off)
         if (after - reference) * sign < threshold * NEARLY or abs(change) <= NO_CHANGE:
             continue
-        place, level = place_of(y, x), reference + sign * threshold
+        place, level = pixel_place(i, steps.width), reference + sign * threshold
         while level * sign > before * sign and level * sign <= after * sign:
             pixels.reference[i] = level
             event_us = start_us + dt * ((np.float64(level) - np.float64(before)) / change)
-            if event_us - pixels.last_event_us[i] >= physics.refractory_us:
+            if event_us - pixels.last_event_us[i] >= physics.refractory_period_us:
                 if n == pending.size:
                     pending = roomier(pending)
                 offset_us = min(np.int64(event_us), np.int64(math.ceil(stop_us)) - 1) - base_us

@@ -13,10 +13,10 @@ import numpy as np
 
 from polarnet.runtime.compilation import ZERO, borrowing, compiled, inlined
 from polarnet.simulation.pixels import active as strips
-from polarnet.simulation.pixels import physics, randomness
+from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.active import empty_active, flagged, gather, keep_continuing, scatter
-from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import intensity_rows, respond
+from polarnet.simulation.pixels.columns import Steps, event_of, place_of, roomier, write_in_order
+from polarnet.simulation.pixels.light import Light, intensity_rows, respond
 from polarnet.simulation.pixels.physics import (
     DARK_OFFSET,
     DARK_SHOT_NOISE,
@@ -29,7 +29,6 @@ from polarnet.simulation.pixels.physics import (
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normal, uniform
 
 EIGHT_BIT_VIDEO = False
-OPTIONS: tuple[str, ...] = ("dark_dn", "photoreceptor_noise", "refractory")
 MIN_LAG = np.float32(1e-12)  # a smaller lag becomes 0: processors are slow with denormal numbers
 LONG_AGO_US = -1e18
 EPSILON = 2.0**-52
@@ -38,8 +37,6 @@ LOG2_E = np.float32(1 / math.log(2))
 # 2^f - 1 on [-1/2, 1/2]: f times a polynomial (Taylor's to f^6, whose error is below 1e-7), in pairs (Estrin's scheme)
 # because processors wait less for short chains
 EXP2 = tuple(np.float32(math.log(2) ** k / math.factorial(k)) for k in range(1, 8))
-
-physics_of = physics.physics_of
 
 
 class Pixels(NamedTuple):
@@ -74,12 +71,14 @@ class Step(NamedTuple):
     has_shots: bool  # whether a shot-noise candidate of any pixel falls into the step
 
 
-def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
-    n = height * width
-    threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
+def start(light: Light, steps: Steps) -> Pixels:
+    """Pixels adapted to the first frame, with the thresholds and leak rates drawn for this channel."""
+    physics, n = steps.physics, steps.height * steps.width
+    threshold_on, threshold_off, leak_factor = mismatch(physics, n, steps.key, steps.channel)
     change, dn, response, lag, leak = np.zeros((5, n), np.float32)
-    return Pixels(
+    intensity_rows(light, ZERO, ZERO, steps.width, dn)
+    respond(dn, physics, response)
+    pixels = Pixels(
         change, dn, response, lag,
         np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32),
         threshold_on, threshold_off,
@@ -87,14 +86,14 @@ def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: 
         leak,
         np.full(n, LONG_AGO_US), np.zeros(n, np.int32), np.full(n, np.inf),
     )  # fmt: skip
+    _draw_phases(pixels, steps)
+    return pixels
 
 
 @compiled
-def start(light, pixels, steps):
-    """Adapt the pixels to the first frame, and draw each pixel's phase of the leak and first shot-noise candidate."""
+def _draw_phases(pixels, steps):
+    """Draw each pixel's phase of the leak and first shot-noise candidate."""
     physics, time_us = steps.physics, steps.times_us[0]
-    intensity_rows(light, ZERO, ZERO, steps.width, pixels.dn)
-    respond(pixels.dn, physics, pixels.response)
     phase_key = key_for(steps.key, randomness.LEAK_PHASE, steps.channel)
     jitter_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
     shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)

@@ -21,13 +21,8 @@ class Light(NamedTuple):
     images: np.ndarray
     """A clip: uint8 or float32 [n, h, w], DN. A scene: float32 [1, H + 1, W + 1], DN; the last row and column repeat
     their neighbours, so that each sensor pixel lies between 2x2 scene pixels."""
-    top: np.ndarray  # float64 [n], scene row at the sensor's first pixel; empty for a clip
-    left: np.ndarray  # float64 [n], scene column at the sensor's first pixel; empty for a clip
-
-
-def light_of_frames(frames: np.ndarray) -> Light:
-    """Light from frames [n, h, w], uint8 or float32 DN."""
-    return Light(frames, np.empty(0), np.empty(0))
+    top: np.ndarray = np.empty(0)  # float64 [n], scene row at the sensor's first pixel; empty for a clip
+    left: np.ndarray = np.empty(0)  # float64 [n], scene column at the sensor's first pixel; empty for a clip
 
 
 @borrowing

@@ -77,7 +77,7 @@ class PixelConfig:
 
 
 class Physics(NamedTuple):
-    """`PixelConfig` for compiled kernels, in v2e's units."""
+    """`PixelConfig` for compiled kernels."""
 
     knee_dn: float  # NO_KNEE_DN: the response has none
     knee_slope: float  # of the response below the knee, per DN
@@ -96,6 +96,8 @@ class Physics(NamedTuple):
     noise_rate_cov_decades: float
     shot_noise_rate_hz: float
     refractory_s: float
+    refractory_period_us: float
+    esim_log_eps: float
     holds: bool  # whether the pixel is held in reset for the refractory period
 
 

@@ -10,21 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from polarnet.runtime.compilation import ZERO, borrowing, compiled
-from polarnet.simulation.pixels import physics, randomness
+from polarnet.simulation.pixels import randomness
 from polarnet.simulation.pixels.active import SPARE, flag_words, flagged, flags_of, rows_of_strip
-from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import intensity_rows, respond_8bit, respond_as_v2e, table_of_response
-from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, Physics, mismatch, shot_noise_fraction, wander
+from polarnet.simulation.pixels.columns import Steps, event_of, pixel_place, roomier, write_in_order
+from polarnet.simulation.pixels.light import Light, intensity_rows, respond_8bit, respond_as_v2e, table_of_response
+from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, mismatch, shot_noise_fraction, wander
 from polarnet.simulation.pixels.randomness import key_for, mixed, rough_normals, uniform
 
 EIGHT_BIT_VIDEO = True
-OPTIONS: tuple[str, ...] = ("dark_dn", "photoreceptor_noise")
 NEARLY = np.float32(1.000001)  # enlarges changes by more than rounding in a first test; `_count` then counts exactly
 PIXEL, EVENT, CROSSED, ACCEPTED = range(4)
 """Columns of the list of firing pixels: index, place and polarity as `columns.event_of` encodes them, crossed
 thresholds and accepted events, the last two negative for OFF."""
-
-physics_of = physics.physics_of
 
 
 class Pixels(NamedTuple):
@@ -39,23 +36,12 @@ class Pixels(NamedTuple):
     refractory_since: np.ndarray  # time in seconds of the last event that started a refractory period
 
 
-class Step(NamedTuple):
-    """One step of a channel."""
+class Firing(NamedTuple):
+    """Pixels that fire in a step, scratch to find and list them, and values that hold for all steps."""
 
-    physics: Physics
-    width: int
-    frame: int  # index into the light of the frame at its end
-    start_us: float
-    stop_us: float
-    leak_key: np.uint64
-    shot_key: np.uint64
+    output: np.ndarray  # of the photoreceptor, noise included, natural-log intensity [h * w]
     max_shot_share: float
     """Upper bound of a pixel's shot-noise rate in the dark, relative to the nominal rate of one polarity."""
-
-
-class Firing(NamedTuple):
-    """Pixels that fire in a step, and scratch to find and list them."""
-
     entries: np.ndarray  # int32 [h * w + 1, 4], a row per pixel: PIXEL, EVENT, CROSSED, ACCEPTED
     order: np.ndarray  # int32, working memory: indices of the entries with events left
     words: np.ndarray  # uint64, flags of a strip
@@ -71,15 +57,16 @@ class Slot(NamedTuple):
     least_s: np.float32  # a pixel fires if its last event is longer ago; -infinity if none can be suppressed
 
 
-def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """State of the pixels before the first frame, with the thresholds and leak rates drawn for this channel."""
-    n = height * width
-    real = np.float64 if physics.cutoff_hz > 0 else np.float32
-    threshold_on, threshold_off, leak_factor = mismatch(physics, n, key, channel)
-    since = np.full(n, -physics.refractory_s, np.float32)
+def start(light: Light, steps: Steps) -> Pixels:
+    """Pixels with low-pass and memory at the first frame, and the thresholds and leak rates drawn for this channel."""
+    physics, n = steps.physics, steps.height * steps.width
+    threshold_on, threshold_off, leak_factor = mismatch(physics, n, steps.key, steps.channel)
+    dn, response = np.empty((2, n), np.float32)
+    _respond(light, steps, ZERO, ZERO, table_of_response(physics), dn, response)
+    memory = response.astype(np.float64 if physics.cutoff_hz > 0 else np.float32)
     noise = np.zeros(n if physics.photoreceptor_noise > 0 else 0, np.float32)
-    memory, filtered = np.zeros((2, n), real)
-    return Pixels(memory, filtered, noise, threshold_on, threshold_off, leak_factor, since)
+    since = np.full(n, -physics.refractory_s, np.float32) + np.float32(min(steps.times_us[0], 0.0) * 1e-6)
+    return Pixels(memory, memory.copy(), noise, threshold_on, threshold_off, leak_factor, since)
 
 
 @borrowing
@@ -92,33 +79,22 @@ def _respond(light, steps, frame, y, table, dn, response):
 
 
 @compiled
-def start(light, pixels, steps):
-    """Set low-pass and memory to the first frame; nothing fires."""
-    dn, response = np.empty(pixels.memory.size, np.float32), np.empty(pixels.memory.size, np.float32)
-    _respond(light, steps, ZERO, ZERO, table_of_response(steps.physics), dn, response)
-    pixels.filtered[:] = pixels.memory[:] = response
-    pixels.refractory_since[:] += np.float32(min(steps.times_us[0], 0.0) * 1e-6)
-
-
-@compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
     physics, times_us, h, w = steps.physics, steps.times_us, steps.height, steps.width
     rows = rows_of_strip(h, w)
     strip, table = np.empty((3, rows * w), np.float32), table_of_response(physics)
     entries, order = np.empty((h * w + 1, 4), np.int32), np.empty(h * w + 1, np.int32)
-    firing = Firing(entries, order, flag_words(rows * w), np.empty((2, rows * w + SPARE), np.int32))
     pending = np.empty(h * w, np.int64)
     leak_key = key_for(steps.key, randomness.LEAK_JITTER, steps.channel)
-    shot_key = key_for(steps.key, randomness.SHOT_NOISE, steps.channel)
     noise_key = key_for(steps.key, randomness.PHOTORECEPTOR, steps.channel)
     output = np.empty_like(pixels.filtered) if physics.photoreceptor_noise > 0 else pixels.filtered
     max_share = physics.threshold_on / pixels.threshold_on.min() + physics.threshold_off / pixels.threshold_off.min()
+    candidates = np.empty((2, rows * w + SPARE), np.int32)
+    firing = Firing(output, max_share, entries, order, flag_words(rows * w), candidates)
     used = ZERO
     for k in range(times_us.size - 1):
         number, frame, dt = steps.first_number + k, steps.first_frame + k, (times_us[k + 1] - times_us[k]) * 1e-6
-        keys = mixed(leak_key, number), mixed(shot_key, number)
-        step = Step(physics, w, frame, times_us[k], times_us[k + 1], keys[0], keys[1], max_share)
         count = ZERO
         for y in range(0, h, rows):
             first, stop = y * w, min(y + rows, h) * w
@@ -134,13 +110,13 @@ def advance(light, pixels, steps, columns):
                 wander(pixels.noise[part], mixed(noise_key, number), first, physics, dt, response)
                 output[part] = filtered + pixels.noise[part]
             if physics.leak_rate_hz > 0:
-                rough_normals(step.leak_key, first, noise)
+                rough_normals(mixed(leak_key, number), first, noise)
                 _leak(memory, threshold_on, pixels.leak_factor[part], noise, dt, physics)
             _flag(output[part], memory, threshold_on, pixels.threshold_off[part], flags_of(firing.words, stop - first))
-            count = _count(pixels, output, steps, first, stop, firing, count)
-        pending, n = _emit(pixels, step, firing, count, pending)
+            count = _count(pixels, steps, first, stop, firing, count)
+        pending, n = _emit(pixels, steps, k, firing, count, pending)
         if physics.shot_noise_rate_hz > 0:
-            pending, n = _emit_shots(light, pixels, output, step, pending, n)
+            pending, n = _emit_shots(light, pixels, firing, steps, k, pending, n)
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
@@ -171,24 +147,21 @@ def _flag(filtered, memory, threshold_on, threshold_off, fires):
 
 
 @borrowing
-def _count(pixels, output, steps, first, stop, firing, n):
+def _count(pixels, steps, first, stop, firing, n):
     """Append the flagged pixels from `first` up to `stop` that cross a threshold to the n listed ones; returns n."""
-    physics, w, entries, candidates = steps.physics, steps.width, firing.entries, firing.candidates
+    physics, entries, candidates = steps.physics, firing.entries, firing.candidates
     count = flagged(firing.words, stop - first, candidates[0], candidates[1])
-    y, row_start = first // w, first
     double = pixels.memory.itemsize == 8  # v2e divides float64 by a Python float where all pixels have one threshold
     for c in range(count):
         i, entry = np.uint64(first + candidates[0, c]), np.uint64(n)  # unsigned: numba checks others for being negative
-        while first + candidates[0, c] >= row_start + w:
-            y, row_start = y + 1, row_start + w
-        change = np.float64(output[i] - pixels.memory[i])
+        change = np.float64(firing.output[i] - pixels.memory[i])
         on, off = np.float64(pixels.threshold_on[i]), np.float64(pixels.threshold_off[i])
         if double and physics.threshold_sigma_on == 0 and physics.threshold_mismatch_on == 0:
             on = physics.threshold_on
         if double and physics.threshold_sigma_off == 0 and physics.threshold_mismatch_off == 0:
             off = physics.threshold_off
         crossed = np.int32(change / (on if change > 0 else off))
-        event = place_of(y, first + candidates[0, c] - row_start) | np.int64(crossed > 0)
+        event = pixel_place(first + candidates[0, c], steps.width) | np.int64(crossed > 0)
         entries[entry, PIXEL], entries[entry, EVENT] = i, event
         entries[entry, CROSSED], entries[entry, ACCEPTED] = crossed, 0
         n += crossed != 0
@@ -196,13 +169,13 @@ def _count(pixels, output, steps, first, stop, firing, n):
 
 
 @compiled
-def _emit(pixels, step, firing, count, pending):
+def _emit(pixels, steps, k, firing, count, pending):
     """Pending events of one step in the order of its slots, and their number.
 
     The busiest pixel of the channel sets the number of slots for all. An event within the refractory period of its
     pixel is suppressed; its change of light can fire in the next step.
     """
-    physics, start_us, stop_us, most = step.physics, step.start_us, step.stop_us, 0
+    physics, start_us, stop_us, most = steps.physics, steps.times_us[k], steps.times_us[k + 1], 0
     for a in range(count):
         most, firing.order[a] = max(most, abs(firing.entries[a, CROSSED])), a
     refractory = physics.refractory_s > (stop_us - start_us) * 1e-6 / max(most, 1)
@@ -260,26 +233,27 @@ def _consume(pixels, entries, count):
 
 
 @compiled
-def _emit_shots(light, pixels, output, step, pending, n):
-    """Append the shot noise of one step to the n pending events: each pixel's probability to fire falls with light.
+def _emit_shots(light, pixels, firing, steps, k, pending, n):
+    """Append the shot noise of step k to the n pending events: each pixel's probability to fire falls with light.
 
     Geometric skipping finds the pixels that would fire in the dark at the channel's lowest thresholds. The draw
     at the pixel's own light and thresholds then keeps a part of them.
     """
-    physics, key, w, pixel_count = step.physics, step.shot_key, step.width, pixels.memory.size
-    half_rate = physics.shot_noise_rate_hz / 2 * ((step.stop_us - step.start_us) * 1e-6)
-    ceiling = min(step.max_shot_share * half_rate, 1.0)
+    physics, w, start_us, stop_us = steps.physics, steps.width, steps.times_us[k], steps.times_us[k + 1]
+    key = mixed(key_for(steps.key, randomness.SHOT_NOISE, steps.channel), steps.first_number + k)
+    half_rate = physics.shot_noise_rate_hz / 2 * ((stop_us - start_us) * 1e-6)
+    ceiling = min(firing.max_shot_share * half_rate, 1.0)
     dn = np.empty(w, np.float32)
     row, i, draw = -1, -1, 0
-    offset_us = np.int64(np.rint(step.stop_us)) - np.int64(math.floor(step.start_us))
+    offset_us = np.int64(np.rint(stop_us)) - np.int64(math.floor(start_us))
     while True:
         gap = math.log(uniform(mixed(key, draw))) / math.log1p(-ceiling) if ceiling < 1 else 0.0
-        if gap >= pixel_count - 1 - i:
+        if gap >= pixels.memory.size - 1 - i:
             break
         i += 1 + int(gap)
         if i // w != row:
             row = i // w
-            intensity_rows(light, step.frame, row, w, dn)
+            intensity_rows(light, steps.first_frame + k, row, w, dn)
         chance = half_rate * shot_noise_fraction(dn[i - row * w])
         on = chance * physics.threshold_on / pixels.threshold_on[i]
         off = chance * physics.threshold_off / pixels.threshold_off[i]
@@ -289,7 +263,7 @@ def _emit_shots(light, pixels, output, step, pending, n):
             continue
         if n == pending.size:
             pending = roomier(pending)
-        pending[n] = event_of(offset_us, place_of(row, i - row * w), u < on)
-        pixels.memory[i] = output[i]
+        pending[n] = event_of(offset_us, pixel_place(i, w), u < on)
+        pixels.memory[i] = firing.output[i]
         n += 1
     return pending, n

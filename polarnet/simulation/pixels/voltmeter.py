@@ -1,6 +1,7 @@
 """The pixel model `dvs_voltmeter` (Lin et al., ECCV 2022): a voltage in Brownian motion with drift between thresholds.
 
-All constants are the paper's, in microseconds and thresholds: an event fires when the voltage has moved by 1.
+All constants are the paper's, in microseconds and thresholds: an event fires when the voltage has moved by 1. They are
+fitted to a DVS346, whatever the configured parameters.
 """
 
 import math
@@ -10,17 +11,15 @@ import numpy as np
 
 from polarnet.runtime.compilation import ZERO, compiled
 from polarnet.simulation.pixels import randomness
-from polarnet.simulation.pixels.columns import event_of, place_of, roomier, write_in_order
-from polarnet.simulation.pixels.light import intensity_rows
-from polarnet.simulation.pixels.physics import PixelConfig
+from polarnet.simulation.pixels.columns import Steps, event_of, pixel_place, roomier, write_in_order
+from polarnet.simulation.pixels.light import Light, intensity_rows
 from polarnet.simulation.pixels.randomness import key_for, mixed, normal, uniform
 
 EIGHT_BIT_VIDEO = False
-OPTIONS: tuple[str, ...] = ()
 DRAWS = 3  # random numbers for the way from one event to the next
 
 
-class Physics(NamedTuple):
+class Constants(NamedTuple):
     """k1 to k6 of the paper's Eq. 10, fitted to one camera."""
 
     k1: float  # drift per relative change of light
@@ -31,7 +30,7 @@ class Physics(NamedTuple):
     k6: float  # noise that does not depend on light
 
 
-DVS346 = Physics(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
+DVS346 = Constants(5.265, 20.0, 1e-4, 1e-7, 5e-9, 1e-5)
 
 
 class Pixels(NamedTuple):
@@ -41,49 +40,38 @@ class Pixels(NamedTuple):
     voltage: np.ndarray  # float64, change since the last event, in thresholds
 
 
-def physics_of(_config: PixelConfig) -> Physics:
-    """The constants fitted to the DVS346, whatever the configured parameters."""
-    return DVS346
-
-
-def initial(height: int, width: int, physics: Physics, key: np.uint64, channel: int) -> Pixels:
-    """State of the pixels before the first frame: light and voltage 0."""
-    return Pixels(np.zeros(height * width, np.float32), np.zeros(height * width))
-
-
-@compiled
-def start(light, pixels, steps):
-    """Adapt the pixels to the first frame; nothing fires."""
+def start(light: Light, steps: Steps) -> Pixels:
+    """Pixels adapted to the first frame, with voltage 0."""
+    n = steps.height * steps.width
+    pixels = Pixels(np.empty(n, np.float32), np.zeros(n))
     intensity_rows(light, ZERO, ZERO, steps.width, pixels.dn)
+    return pixels
 
 
 @compiled
 def advance(light, pixels, steps, columns):
     """Advance the pixels through `steps`, in place; return the columns with the events, and the number of events."""
-    h, w, used = steps.height, steps.width, ZERO
-    dn, pending = np.empty(w, np.float32), np.empty(h * w, np.int64)
+    dn, pending, used = np.empty_like(pixels.dn), np.empty(pixels.dn.size, np.int64), ZERO
     for k in range(steps.times_us.size - 1):
-        n = ZERO
-        for y in range(h):
-            intensity_rows(light, steps.first_frame + k, y, w, dn)
-            pending, n = _walk(pixels, steps, k, y, dn, pending, n)
+        intensity_rows(light, steps.first_frame + k, ZERO, steps.width, dn)
+        pending, n = _walk(pixels, steps, k, dn, pending)
         columns, used = write_in_order(steps, k, pending, n, columns, used)
     return columns, used
 
 
 @compiled
-def _walk(pixels, steps, k, y, dn, pending, n):
-    """Move the voltages of row y from threshold to threshold through step k; return the pending events and number."""
-    physics, start_us, dt = steps.physics, steps.times_us[k], steps.times_us[k + 1] - steps.times_us[k]
-    base_us = math.floor(start_us)
+def _walk(pixels, steps, k, dn, pending):
+    """Move the voltages from threshold to threshold through step k; return the pending events and their number."""
+    k1, k2, k3, k4, k5, k6 = DVS346
+    start_us, dt = steps.times_us[k], steps.times_us[k + 1] - steps.times_us[k]
+    base_us, n = math.floor(start_us), ZERO
     key = mixed(key_for(steps.key, randomness.FIRST_PASSAGE, steps.channel), steps.first_number + k)
-    for x in range(dn.size):
-        i = y * dn.size + x
-        before, after = np.float64(pixels.dn[i]), np.float64(dn[x])
+    for i in range(dn.size):
+        before, after = np.float64(pixels.dn[i]), np.float64(dn[i])
         mean = (before + after) / 2
-        drift = physics.k1 * (after - before) / dt / (mean + physics.k2) + physics.k4 + physics.k5 * mean
-        noise = physics.k3 * math.sqrt(mean) / (mean + physics.k2) + physics.k6
-        pixel_key, draw, now, voltage, place = mixed(key, i), 0, 0.0, pixels.voltage[i], place_of(y, x)
+        drift = k1 * (after - before) / dt / (mean + k2) + k4 + k5 * mean
+        noise = k3 * math.sqrt(mean) / (mean + k2) + k6
+        pixel_key, draw, now, voltage = mixed(key, i), 0, 0.0, pixels.voltage[i]
         while True:
             on = uniform(mixed(pixel_key, draw)) < chance_of_on(drift, noise, 1 - voltage, 1 + voltage)
             distance = 1 - voltage if on else 1 + voltage
@@ -95,10 +83,10 @@ def _walk(pixels, steps, k, y, dn, pending, n):
             now, voltage = now + wait, 0.0
             if n == pending.size:
                 pending = roomier(pending)
-            pending[n] = event_of(np.int64(start_us - base_us + now), place, on)
+            pending[n] = event_of(np.int64(start_us - base_us + now), pixel_place(i, steps.width), on)
             n += 1
         pixels.voltage[i] = voltage + (distance if on else -distance) * (dt - now) / wait
-        pixels.dn[i] = dn[x]
+        pixels.dn[i] = dn[i]
     return pending, n
 
 
