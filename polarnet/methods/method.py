@@ -62,18 +62,10 @@ class Setup:
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
 
-    def autocast(self) -> torch.autocast:
-        """Context manager that sets the precision of networks."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")
-
 
 def windows_at_once(height: int, width: int) -> int:
     """Number of windows of this size in pixels that a method processes at once."""
     return max(1, PIXELS_AT_ONCE // (height * width))
-
-
-def no_state(height: int, width: int) -> None:
-    """State before the first event of a network that makes its own."""
 
 
 class Recoverer(NamedTuple):
@@ -114,21 +106,20 @@ class Recoverer(NamedTuple):
 
 def network_recoverer(
     network: Any,
-    setup: Setup,
+    device: torch.device,
+    precision: str,
     encode: Callable[[EventWindow], Tensor],
-    prediction_of: Callable[[Tensor], Prediction],
+    prediction_of: Callable[[Any], Prediction],
 ) -> Recoverer:
-    """Run a recurrent network on one encoded window after the other; `prediction_of` takes its outputs of n windows."""
+    """Run a recurrent network on encoded windows; `prediction_of` takes the outputs of n windows (`unroll`)."""
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        outputs = []
-        for window in windows:
-            with setup.autocast():
-                output, state = network(encode(window), state)
-            outputs.append(output.float())
-        return state, prediction_of(torch.stack(outputs))
+        inputs = torch.stack([encode(window) for window in windows]).to(device)
+        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
+            outputs, state = network.unroll(inputs, state)
+        return state, prediction_of(outputs)
 
-    return Recoverer(no_state, predict, network=network)
+    return Recoverer(lambda height, width: None, predict, network=network)
 
 
 @dataclass(frozen=True)
