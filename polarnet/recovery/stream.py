@@ -89,7 +89,7 @@ def open_method(
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")
     recoverer = method.open(setup)
-    whole = ", over the whole recording (--method ours: only the past)" if recoverer.sees_ahead else ""
+    whole = ", over the whole recording (--method ours: only the past)" if recoverer.between else ""
     if setup.frames is not None:
         whole += f", with {len(setup.frames.t_us)} frames of the camera"
     return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
