@@ -39,13 +39,6 @@ class Prediction(NamedTuple):
     intensities: Float[Tensor, "*b 4 h w"] | None = None
     """Intensities behind the polarizers at 0, 45, 90 and 135 degrees from which DoLP was computed."""
 
-    @property
-    def plain(self) -> Float[Tensor, "*b h w"] | None:
-        """Intensity seen by a camera without polarizers; None for any other."""
-        if self.intensities is None or self.intensities.shape[-3] > 1:
-            return None
-        return self.intensities[..., 0, :, :].float()
-
 
 class StokesFrames(NamedTuple):
     """What the frames of a polarization camera show of s1 = S1 / S0 and s2 = S2 / S0."""

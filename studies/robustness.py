@@ -206,7 +206,7 @@ def with_frames(
 ) -> tuple[dict[str, Prediction], TestSequence, dict[str, Prediction]]:
     """`registered`, the nearest frame and the filter for each rate of FRAMES_HZ, and `between_windows`."""
     predictions, between = {}, None
-    method, windows = METHODS[WHOLE], test.windows_for(False)
+    method, windows = METHODS[WHOLE], test.windows()
     for rate_hz in FRAMES_HZ:
         frames = camera_frames(scenes, test.name, int(test.t_us[-1]), rate_hz)
         recoverer = method.open(replace(context.setups[method.section], frames=frames))
@@ -252,7 +252,7 @@ def between_windows(
     scenes: SceneStore, test: TestSequence, recoverer: Recoverer, state: State, first: int
 ) -> tuple[TestSequence, dict[str, Prediction]]:
     """Maps at times between windows, from window `first` on, of the run that ended in `state`; with their truth."""
-    windows = test.windows_for(False)
+    windows = test.windows()
     t_us = np.arange(windows[first].start_us, windows[-1].stop_us, BETWEEN_US) // (10**6 // BETWEEN_HZ)
     t_us = t_us[1:] * (10**6 // BETWEEN_HZ)
     truth = sequence_at(scenes, test.name, test.events, torch.from_numpy(np.concatenate([[0], t_us])))

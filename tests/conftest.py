@@ -140,7 +140,7 @@ def brief_costs() -> Iterator[None]:
     """Measure the cost of a benchmark row once on one window; a full measurement takes longer than the scores."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         for name in ("COUNTED_WINDOWS", "TIMED_WINDOWS", "REPEATS"):
-            monkeypatch.setattr(f"polarnet.benchmark.cost.{name}", 1)
+            monkeypatch.setattr(f"polarnet.benchmark.rows.{name}", 1)
         yield
 
 

@@ -1,22 +1,28 @@
-"""Rows of the benchmark: references and methods, and running them over a sequence."""
+"""Rows of the benchmark: references and methods, running them over a sequence, and their cost on this machine."""
 
 import functools
+import statistics
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from polarnet.benchmark.score import Cost
 from polarnet.benchmark.sequences import TestSequence
-from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS, ROWS
-from polarnet.methods.method import Method, Recoverer, Setup, each_map, joined, weights_record, why_absent
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_record, why_absent
 from polarnet.metrics.references import REFERENCES
 from polarnet.stokes import Prediction
 from polarnet.terminal.progress import steps
 
 MAX_OPEN = 32
 """Maximum number of methods whose weights stay in memory between sequences."""
+COUNTED_WINDOWS = 3  # windows to count arithmetic over: enough for the state to be passed on
+TIMED_WINDOWS = 6
+REPEATS = 3  # number of timings; the median is reported
 
 
 @dataclass(frozen=True)
@@ -39,8 +45,11 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
         if name in REFERENCES:
             prediction = REFERENCES[name].predict(sequence.dolp, sequence.valid, context.train_mean)
         else:
-            method = METHODS[name]
-            prediction = predicted_over(opened(method, context), sequence.windows_for(method.rotating))
+            method, size = METHODS[name], sequence.dolp.shape[-2:]
+            recoverer = opened(method, context)
+            at_once = recoverer.at_once(*size) if recoverer.between else 1  # one at a time as from a camera, or a file
+            _, prediction = recoverer.run(recoverer.start(*size), sequence.windows(method.rotating), at_once)
+            prediction = prediction._replace(stokes=None, intensities=None)
         predictions[name] = each_map(prediction, Tensor.cpu)
         for maps in prediction:
             if maps is not None and not (finite := maps.isfinite().flatten(1).all(1)).all():
@@ -49,18 +58,6 @@ def predictions_of(names: Sequence[str], sequence: TestSequence, context: Contex
                     f"not numbers; the method, its weights or the events are damaged"
                 )
     return predictions
-
-
-def predicted_over(recoverer: Recoverer, windows: Sequence[EventWindow]) -> Prediction:
-    """DoLP, AoLP and expected error over consecutive windows, one at a time as from a camera, or as from a file."""
-    first = windows[0].channels[0]
-    state = recoverer.start(first.height, first.width)
-    at_once = recoverer.at_once(first.height, first.width) if recoverer.sees_ahead else 1
-    frames = []
-    for k in range(0, len(windows), at_once):
-        state, prediction = recoverer.step(state, windows[k : k + at_once])
-        frames.append(prediction._replace(stokes=None, intensities=None))
-    return joined(frames)
 
 
 def opened(method: Method, context: Context) -> Recoverer:
@@ -92,3 +89,33 @@ def weights_used(names: Sequence[str], context: Context) -> dict[str, dict[str, 
     """File name, sha256 and network of the weights, by section of `methods`, for the rows that need weights."""
     methods = [METHODS[name] for name in names if name in METHODS and METHODS[name].networks]
     return {method.section: weights_record(method, context.setups[method.section]) for method in methods}
+
+
+def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
+    """Measure a row on the first windows of a sequence, several times; the first call is not timed."""
+    from torch.utils.flop_counter import FlopCounterMode  # it takes a second to import
+
+    recoverer = opened(METHODS[row], context) if row in METHODS else None
+    network = recoverer.network if recoverer else None
+    timed = recoverer.at_once(*sequence.dolp.shape[-2:]) if recoverer and recoverer.between else TIMED_WINDOWS
+    few, many = first_windows(sequence, COUNTED_WINDOWS), first_windows(sequence, timed)
+    predictions_of([row], few, context)  # compiles and allocates
+    with FlopCounterMode(display=False) as flops:
+        predictions_of([row], few, context)
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        predictions_of([row], many, context)
+        seconds.append(time.perf_counter() - start)
+    return Cost(
+        ms_per_window=1000 * statistics.median(seconds) / len(many.dolp),
+        gflop=flops.get_total_flops() / len(few.dolp) / 1e9 if network is not None else None,
+        params=sum(p.numel() for p in network.parameters()) if network is not None else 0,
+    )
+
+
+def first_windows(sequence: TestSequence, count: int) -> TestSequence:
+    """The first `count` windows of a sequence; all of it if it is shorter. Later events belong to no window."""
+    maps = {name: getattr(sequence, name) for name in ("dolp", "aolp", "s0", "valid")}
+    shorter: dict[str, Any] = {name: None if frames is None else frames[:count] for name, frames in maps.items()}
+    return replace(sequence, t_us=sequence.t_us[: count + 1], **shorter)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from polarnet.benchmark.rows import Context, predictions_of
+from polarnet.benchmark.rows import Context, cost_of, predictions_of
 from polarnet.benchmark.score import BenchmarkConfig, Cost, FrameScore, score_sequence, scored_windows
 from polarnet.benchmark.sequences import BenchmarkSet, TestSequence
 from polarnet.events.representations import event_tensor, polarity_sums
@@ -48,8 +48,6 @@ def run_benchmark(
     `mapper` is `polarnet.runtime.cluster.pmap` with its workers bound, or the built-in `map`; each task is one
     sequence. Costs are measured in this process, one method after another, on the first sequence.
     """
-    from polarnet.benchmark.cost import cost_of  # torch's counter of operations takes a second to import
-
     names = test_set.sequences
     firsts: dict[str, str] = {}
     for name in names:
@@ -114,7 +112,7 @@ def _spread(values: Sequence[Item], count: int) -> list[Item]:
 
 def panel_of(sequence: TestSequence, predictions: Mapping[str, Prediction], warmup_windows: int) -> Panel:
     """Panel of the middle scored window, with a film of windows spread evenly over the scored ones."""
-    scored, windows = scored_windows(sequence, warmup_windows), sequence.windows
+    scored, windows = scored_windows(sequence, warmup_windows), sequence.windows()
     k = scored[len(scored) // 2]
     film = _spread(scored, MAX_FILM_FRAMES)
     counts = [torch.stack([polarity_sums(channel) for channel in windows[one].channels]).sum(0) for one in film]

@@ -1,5 +1,6 @@
 """Scores of predictions: one row per frame, means over frames and then scenes with intervals, paired comparisons."""
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,10 +28,6 @@ from polarnet.runtime.machine import generator_for
 from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import Prediction
 
-METRICS = (
-    "mse", "psnr", "ssim", "lpips", "corr", "grad", "level_mse", "pattern_mse", "offset", "no_offset_mse", "aolp_deg",
-    "skill",
-)  # fmt: skip
 SETS = ("simulated", "measured")
 """Test sets: the pipeline's held-out sequences, the same pictures under harder motion, measured polarization."""
 
@@ -94,6 +91,7 @@ class FrameScore(NamedTuple):
 
 
 SCORES = FrameScore._fields[FrameScore._fields.index("mse") :]
+METRICS = (*SCORES[:-1], "skill")
 
 
 @dataclass(frozen=True)
@@ -171,17 +169,13 @@ def scene_means(rows: Iterable[FrameScore], metric: str) -> dict[str, dict[str, 
             method: {scene: _skill(error, oracles[method][scene]) for scene, error in scenes.items()}
             for method, scenes in errors.items()
         }
-    values: dict[str, dict[str, list[float]]] = {}
-    lacking = set()
+    values: dict[str, dict[str, list[Any]]] = {}
     for row in rows:
-        value = getattr(row, metric)
-        values.setdefault(row.method, {}).setdefault(row.scene, []).append(value)
-        if value is None:
-            lacking.add(row.method)
+        values.setdefault(row.method, {}).setdefault(row.scene, []).append(getattr(row, metric))
     return {
         method: {scene: math.fsum(of_scene) / len(of_scene) for scene, of_scene in sorted(scenes.items())}
         for method, scenes in values.items()
-        if method not in lacking
+        if None not in itertools.chain(*scenes.values())
     }
 
 

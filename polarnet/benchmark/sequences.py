@@ -35,12 +35,7 @@ class TestSequence:
     rotating: Events | None = None
     """Events of one camera behind a rotating polarizer that moves like the four channels; None: not simulated."""
 
-    @property
-    def windows(self) -> list[EventWindow]:
-        """Windows of the four channels."""
-        return self.windows_for(rotating=False)
-
-    def windows_for(self, rotating: bool) -> list[EventWindow]:
+    def windows(self, rotating: bool = False) -> list[EventWindow]:
         """Windows of the four channels, or of the camera behind a rotating polarizer, in the first channel.
 
         They lie between consecutive frames and are half-open: each includes its start and excludes its end. ValueError

@@ -5,18 +5,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float64
 
 from polarnet.characterization.flicker import (
-    FlickerRecording,
+    GROUPS,
+    Flicker,
     Source,
     bandwidth,
     increments_of,
     source_of,
     thresholds_without_leak,
 )
-from polarnet.characterization.intervals import GROUPS, Estimate, piled_up_us
 from polarnet.characterization.noise import Noise, estimate_noise, hot_under_constant_light, nominal_shot_noise_hz
-from polarnet.characterization.thresholds import PixelThresholds, correlation, deviation
+from polarnet.characterization.thresholds import Estimate, PixelThresholds, correlation, deviation
 from polarnet.events.intervals import by_pixel, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.simulation.pixels.physics import PixelConfig
@@ -24,6 +25,8 @@ from polarnet.terminal.progress import ProgressBar
 
 MAX_LEAK_ERROR = 0.05  # relative; above it shot noise hides the leak, and its error is unreliable
 MIN_PIXELS = 50
+PILE_UP = 3.0  # intervals of 0.9 to 1.1 times the shortest, over those of 1.1 to 1.3 times the shortest
+MIN_TICKS = 5  # ticks of the recording's clock in the shortest refractory period that can be measured
 MAX_SWING = 0.3  # relative swing of the OFF rate under constant light; larger: something moved or flickered
 FLICKER_PARAMETERS = (
     "contrast_threshold_on", "contrast_threshold_off", "contrast_threshold_sigma_on", "contrast_threshold_sigma_off",
@@ -53,7 +56,7 @@ class SensorFit:
 
 
 def fit_sensor(
-    static: Events | None, static_light: float, flickers: Sequence[FlickerRecording], pixel: PixelConfig
+    static: Events | None, static_light: float, flickers: Sequence[tuple[Events, Flicker]], pixel: PixelConfig
 ) -> SensorFit:
     """Fit a sensor to recordings of one camera.
 
@@ -61,7 +64,7 @@ def fit_sensor(
     and the jitter of the leak. ValueError if nothing was recorded, or if the recordings are of sensors of different
     sizes.
     """
-    recordings = [*([] if static is None else [static]), *(one.events for one in flickers)]
+    recordings = [*([] if static is None else [static]), *(events for events, _ in flickers)]
     sizes = {(one.height, one.width) for one in recordings}
     if len(sizes) != 1:
         raise ValueError(f"expected recordings of one sensor, got sizes {sorted(sizes)} (height, width)")
@@ -84,7 +87,7 @@ def fit_sensor(
     fit.enter("leak_rate_hz", leak, "needs a static recording" if noise is None else reason)
     shortest_us, flickering = dead_time.value if dead_time else 0.0, ordered[len(ordered) - len(flickers) :]
     recorded = ProgressBar(zip(flickers, flickering, strict=True), "fit", len(flickers), unit="recording")
-    sources = [source_of(one, events, pixel, shortest_us) for one, events in recorded]
+    sources = [source_of(events, flicker, pixel, shortest_us) for (_, flicker), events in recorded]
     deviations = _fit_flicker(fit, sources, leak.value if leak else 0.0) if sources else (0.0, 0.0)
     if not sources:
         fit.missing |= dict.fromkeys(FLICKER_PARAMETERS, "needs a flicker recording")
@@ -93,6 +96,25 @@ def fit_sensor(
     else:
         _enter_noise(fit, noise, static_light, deviations)
     return fit
+
+
+def piled_up_us(durations_us: Sequence[Float64[np.ndarray, " _"]]) -> Estimate | None:
+    """Shortest interval, if intervals pile up there: crossings within the refractory period waited for its end."""
+    durations = np.sort(np.concatenate(durations_us))
+    durations = durations[durations > 0]
+    supported = max(5, int(1e-5 * len(durations)))
+    if len(durations) <= supported:
+        return None
+    shortest = durations[supported]
+    tick_us = float(np.gcd.reduce(np.rint(durations).astype(np.int64)))  # step of the recording's clock
+    if shortest < MIN_TICKS * tick_us:
+        return None  # a coarse clock piles intervals up as well
+    edges = np.searchsorted(durations, shortest * np.array([0.9, 1.1, 1.3]))
+    piled, next_to = np.diff(edges)
+    if piled < 20 or piled < PILE_UP * next_to:
+        return None
+    near = durations[edges[0] : edges[1]]
+    return Estimate(float(np.median(near)), float(near.std()) / math.sqrt(len(near)), "shortest intervals of a pixel")
 
 
 def _fit_flicker(fit: SensorFit, sources: Sequence[Source], leak_hz: float) -> tuple[float, float]:
@@ -141,10 +163,9 @@ def _grouped_error(function: Callable[[list[PixelThresholds]], float], threshold
 
 def _enter_noise(fit: SensorFit, noise: Noise, light: float, deviations: tuple[float, float]) -> None:
     """Enter shot noise and hot pixels; `deviations` are the relative ones of the thresholds."""
-    rate = noise.shot_on_hz + noise.shot_off_hz
-    value = nominal_shot_noise_hz(rate, light, *deviations)
+    value = nominal_shot_noise_hz(noise.shot_hz, light, *deviations)
     source = f"{noise.duration_s:.0f} s under constant light of {light:g} DN"
-    fit.estimates["shot_noise_rate_hz"] = Estimate(value, value * noise.shot_error_hz / rate, source)
+    fit.estimates["shot_noise_rate_hz"] = Estimate(value, value * noise.shot_error_hz / noise.shot_hz, source)
     count, rates_hz = len(noise.hot_rates_hz), noise.hot_rates_hz
     source = "more than 10 times the events of their neighbours under constant light"
     share = Estimate(float(noise.hot.mean()), math.sqrt(max(count, 1)) / len(noise.hot), source)

@@ -18,10 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.optimize import minimize_scalar
 
-from polarnet.characterization.intervals import GROUPS, MAX_RELATIVE_ERROR, Estimate, undisturbed
-from polarnet.characterization.thresholds import PixelThresholds, misfit, pixel_thresholds
+from polarnet.characterization.thresholds import Estimate, PixelThresholds, misfit, pixel_thresholds
 from polarnet.events.intervals import Intervals, PixelEvents, intervals_of
-from polarnet.events.stream import Events
 from polarnet.simulation.pixels.light import FULL_SCALE, respond_as_v2e
 from polarnet.simulation.pixels.physics import DARK_OFFSET, SATURATION, PixelConfig, physics_of
 
@@ -30,6 +28,8 @@ PHASES = 32
 PHASE_INTERVALS = 6000  # intervals that the phase is fitted to
 BLOCK = 8  # consecutive intervals; even blocks make one half of the data, odd blocks the other
 LEAKED = 0.25  # of a threshold: an interval in which the leak alone makes more is not used
+GROUPS = 8  # groups of pixels, whose differences give standard errors
+MAX_RELATIVE_ERROR = 0.5  # a bandwidth with a larger standard error is discarded
 CUTOFF_PIXELS = 600  # pixels that the bandwidth is fitted to
 CUTOFF_GRID = np.geomspace(5, 2500, 14)  # Hz, first guesses
 
@@ -58,15 +58,6 @@ class Flicker:
     def light(self, phase: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
         """DN at phases in radians."""
         return self.level * (1 + self.contrast * np.sin(phase))
-
-
-@dataclass(frozen=True)
-class FlickerRecording:
-    """A recording under a flicker whose phase is not known."""
-
-    name: str
-    events: Events
-    flicker: Flicker
 
 
 def flicker_cycle(flicker: Flicker, pixel: PixelConfig, cutoff_hz: float) -> Float64[np.ndarray, " n"]:
@@ -121,10 +112,22 @@ class Increments(NamedTuple):
     block: Int64[np.ndarray, " n"]
 
 
-def source_of(recording: FlickerRecording, events: PixelEvents, pixel: PixelConfig, refractory_us: float) -> Source:
-    """The intervals of a recording that the refractory period does not disturb; `events` are those of `recording`."""
+def undisturbed(intervals: Intervals, refractory_us: float) -> Intervals:
+    """Intervals longer than 1.3 times the refractory period, except those right after a shorter one.
+
+    A crossing within the refractory period waits for its end: its increment exceeds one threshold, and the next
+    increment lacks the excess.
+    """
+    free = intervals.duration_us > 1.3 * refractory_us
+    after_waiting = np.zeros(len(free), bool)
+    after_waiting[1:] = (intervals.pixel[1:] == intervals.pixel[:-1]) & ~free[:-1]
+    return intervals.chosen(free & ~after_waiting)
+
+
+def source_of(events: PixelEvents, stated: Flicker, pixel: PixelConfig, refractory_us: float) -> Source:
+    """The intervals of a recording under a flicker, of unknown phase, that the refractory period does not disturb."""
     intervals = undisturbed(intervals_of(events), refractory_us)
-    flicker = exact_frequency(recording.flicker, events)
+    flicker = exact_frequency(stated, events)
 
     @functools.cache
     def cycle_and_phase(cutoff_hz: float) -> tuple[Float64[np.ndarray, " k"], float]:
@@ -135,7 +138,7 @@ def source_of(recording: FlickerRecording, events: PixelEvents, pixel: PixelConf
         cycle, phase = cycle_and_phase(cutoff_hz)
         return flicker_responses(cycle, flicker.frequency_hz, phase, t_us)
 
-    return Source(recording.name, intervals, responses, events.pixels)
+    return Source(f"flicker {stated.frequency_hz:g} Hz", intervals, responses, events.pixels)
 
 
 def increments_of(sources: Sequence[Source], cutoff_hz: float) -> Increments:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.optimize import brentq
 
-from polarnet.characterization.intervals import Estimate
+from polarnet.characterization.thresholds import Estimate
 from polarnet.events.intervals import PixelEvents, chosen_pixels, intervals_of
 from polarnet.events.stream import Events
 from polarnet.recordings.noise import event_counts, hot_pixels
@@ -31,11 +31,10 @@ class Noise(NamedTuple):
 
     leak: Estimate | None
     """Median over the pixels; None without more ON events than shot noise has."""
-    shot_on_hz: float
-    """Mean over the pixels."""
-    shot_off_hz: float
+    shot_hz: float
+    """Shot noise, ON and OFF; mean over the pixels."""
     shot_error_hz: float
-    """Standard error of the sum of both means."""
+    """Its standard error."""
     hot: Bool[np.ndarray, " pixels"]
     hot_rates_hz: Float64[np.ndarray, " hot"]
     """Events per second of each hot pixel."""
@@ -75,8 +74,7 @@ def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"], pixel:
     poisson = math.sqrt((shot_on + shot_off) / exposure_s)
     return Noise(
         leak=leak,
-        shot_on_hz=shot_on,
-        shot_off_hz=shot_off,
+        shot_hz=shot_on + shot_off,
         shot_error_hz=max(poisson, float(off.std()) / math.sqrt(good)),
         hot=hot,
         hot_rates_hz=counts[hot] / duration_s,

@@ -16,6 +16,15 @@ MAX_SCALE = 0.15
 TUKEY = 4.685  # width of the biweight in standard deviations: 95 % efficiency for normal errors
 
 
+class Estimate(NamedTuple):
+    """A parameter of the sensor."""
+
+    value: float
+    error: float
+    """Standard error."""
+    source: str  # recordings and events behind the estimate, in words
+
+
 class PixelThresholds(NamedTuple):
     """Thresholds of one polarity."""
 

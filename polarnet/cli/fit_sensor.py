@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from polarnet.characterization.fit import SensorFit, fit_sensor
-from polarnet.characterization.flicker import Flicker, FlickerRecording
+from polarnet.characterization.flicker import Flicker
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.recordings.recording import read_recording
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     static = recordings.pop(0) if options.static else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
     flickers = [
-        FlickerRecording(f"flicker {hz:g} Hz", events, Flicker(options.flicker_light, options.contrast, hz))
+        (events, Flicker(options.flicker_light, options.contrast, hz))
         for events, hz in zip(recordings, options.frequency or [], strict=True)
     ]
     fit = fit_sensor(static, static_light, flickers, SENSORS["default"])

@@ -3,9 +3,9 @@
 E2P (Mei et al., CVPR 2023) takes the four channels interleaved as a mosaic of twice the height and width.
 """
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any
 
 import torch
@@ -18,17 +18,7 @@ from polarnet.events.representations import REPRESENTATIONS, Encode, event_count
 from polarnet.events.stream import Events
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensity_networks import load_baseline, voxel_grids
-from polarnet.methods.method import (
-    Method,
-    Recoverer,
-    Setup,
-    State,
-    each_map,
-    network_recoverer,
-    no_state,
-    weights_file,
-    windows_at_once,
-)
+from polarnet.methods.method import Method, Recoverer, Setup, each_map, network_recoverer, weights_file, windows_at_once
 from polarnet.methods.overlap import of_any_length
 from polarnet.networks.base.checkpoint import trained_window_us
 from polarnet.networks.e2p.network import MOSAIC, E2p, angle_of, interleaved
@@ -79,17 +69,18 @@ def dolp_recoverer(
         ready.scale.given = mean / ready.step
         encode = weighted_counts([threshold / mean for threshold in thresholds])
 
-    def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        inputs = torch.stack([_encoded(window, encode) for window in windows])
-        with torch.autocast(place.type, torch.bfloat16, enabled=precision == "bf16"):
-            prediction, state = ready.unroll(inputs[:, None].to(place), state)
-        return state, each_map(prediction, lambda field: field[:, 0])
+    def encoded(window: EventWindow) -> Float[Tensor, "1 c h w"]:
+        images = torch.stack([encode(events, window.length_us) for events in window.channels])
+        return images.view(1, -1, *images.shape[-2:])
+
+    def of_stream(prediction: Prediction) -> Prediction:
+        return each_map(prediction, lambda field: field[:, 0])
 
     def at_once(height: int, width: int) -> int:
         side = getattr(ready, "binning", 1)
         return windows_at_once(height // side, width // side)
 
-    recoverer = Recoverer(no_state, predict, network=ready, at_once=at_once)
+    recoverer = network_recoverer(ready, place, precision, encoded, of_stream)._replace(at_once=at_once)
     trained_us = trained_window_us(metadata)
     return recoverer if trained_us is None else of_any_length(recoverer, trained_us)
 
@@ -105,11 +96,6 @@ def weighted_counts(steps: Sequence[float]) -> Encode:
     return encode
 
 
-def _encoded(window: EventWindow, encode: Encode) -> Float[Tensor, "c h w"]:
-    images = [encode(events, window.length_us) for events in window.channels]
-    return torch.cat([image.view(-1, *image.shape[-2:]) for image in images])
-
-
 def open_dolp_network(setup: Setup) -> Recoverer:
     """Open the DoLP network from the checkpoint in the setup."""
     network, metadata = load_network(weights_file(setup))
@@ -117,37 +103,33 @@ def open_dolp_network(setup: Setup) -> Recoverer:
     return dolp_recoverer(network, metadata, setup.device, setup.precision, *options)
 
 
-def open_e2p(setup: Setup, *, published: bool) -> Recoverer:
-    """Open E2P; its authors' weights (`published`) saw one voxel grid of the whole mosaic, polarnet's one a channel."""
-    network = load_baseline({"e2p": E2p}, weights_file(setup)).to(setup.device)
+def open_e2p(setup: Setup) -> Recoverer:
+    """Open E2P; its authors' weights saw one voxel grid of the whole mosaic, polarnet's checkpoints one a channel."""
+    path = weights_file(setup)
+    network, published = load_baseline({"e2p": E2p}, path).to(setup.device), path.suffix != ".safetensors"
 
     def encode(window: EventWindow) -> Float[Tensor, "1 bins h w"]:
         if published:
-            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins).to(setup.device)[None]
-        return interleaved(voxel_grids(window, network.bins)).to(setup.device)[None]
+            return voxel_grid(join_mosaic(window.channels, MOSAIC), network.bins)[None]
+        return interleaved(voxel_grids(window, network.bins))[None]
 
     def prediction_of(maps: Float[Tensor, "n 1 maps h w"]) -> Prediction:
         return Prediction(maps[:, 0, -1], angle_of(maps[:, 0]))
 
-    return network_recoverer(network, setup, encode, prediction_of)
+    return network_recoverer(network, setup.device, setup.precision, encode, prediction_of)
 
 
+E2P = Method(
+    name="e2p",
+    label="E2P",
+    colour="#7a5cc4",
+    open=open_e2p,
+    networks=("e2p",),
+    about="E2P (Mei et al. 2023), a published network from events to polarization.",
+)
 METHODS = (
-    Method(
-        name="e2p",
-        label="E2P",
-        colour="#7a5cc4",
-        open=functools.partial(open_e2p, published=False),
-        networks=("e2p",),
-        about="E2P (Mei et al. 2023), a published network from events to polarization.",
-    ),
-    Method(
-        name="e2p_published",
-        label="E2P, published weights",
-        colour="#7a5cc4",
-        open=functools.partial(open_e2p, published=True),
-        networks=("e2p",),
-    ),
+    E2P,
+    replace(E2P, name="e2p_published", label="E2P, published weights", about=""),
     Method(
         name="paper",
         label="the paper's network",

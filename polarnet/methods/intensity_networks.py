@@ -70,7 +70,7 @@ def intensity_methods(
         def prediction_of(raw: Float[Tensor, "n c h w"]) -> Prediction:
             return from_intensities(sharper(raw) if sharpened else raw.clamp(0, 1))
 
-        return network_recoverer(network, setup, encode, prediction_of)
+        return network_recoverer(network, setup.device, setup.precision, encode, prediction_of)
 
     method = Method(
         name=name,

@@ -62,18 +62,10 @@ class Setup:
     def __hash__(self) -> int:
         return hash((self.weights, self.device, self.precision))  # settings may be lists, which have no hash
 
-    def autocast(self) -> torch.autocast:
-        """Context manager that sets the precision of networks."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16")
-
 
 def windows_at_once(height: int, width: int) -> int:
     """Number of windows of this size in pixels that a method processes at once."""
     return max(1, PIXELS_AT_ONCE // (height * width))
-
-
-def no_state(height: int, width: int) -> None:
-    """State before the first event of a network that makes its own."""
 
 
 class Recoverer(NamedTuple):
@@ -94,41 +86,47 @@ class Recoverer(NamedTuple):
     at_once: Callable[[int, int], int] = windows_at_once
     """Height and width of a channel -> number of windows of a run (`step`), if so many are known already."""
 
-    sees_ahead: bool = False
-    """Whether the frames of a run also depend on its later windows; runs should then be as long as `at_once` says."""
     between: Callable[[State, Int64[np.ndarray, " n"]], Prediction] | None = None
-    """State after a run and n times within its windows, in microseconds -> the maps at these times. None if the method
+    """State after a run and n times within its windows, in microseconds -> the maps at these times. The frames of such
+    a method also depend on the later windows of their run, which should be as long as `at_once` says. None if a method
     has frames at the ends of its windows alone: windows must overlap for a higher rate."""
 
     @torch.no_grad()
     def step(self, state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
         """State and prediction after n windows, each of which starts at the end of the previous one.
 
-        Maps are n h w, on the method's device. DoLP is float32, clamped to [0, 1] for all methods.
+        Maps are n h w. DoLP is float32, clamped to [0, 1] for all methods.
         """
         state, prediction = self.predict(state, windows)
         aolp, log_variance = (None if x is None else x.float() for x in (prediction.aolp, prediction.log_variance))
         dolp = prediction.dolp.float().clamp(0, 1)
         return state, prediction._replace(dolp=dolp, aolp=aolp, log_variance=log_variance)
 
+    def run(self, state: State, windows: Sequence[EventWindow], at_once: int) -> tuple[State, Prediction]:
+        """`step` over `at_once` windows at a time; maps of all windows, on the CPU."""
+        parts = []
+        for first in range(0, len(windows), at_once):
+            state, part = self.step(state, windows[first : first + at_once])
+            parts.append(each_map(part, Tensor.cpu))
+        return state, joined(parts)
+
 
 def network_recoverer(
     network: Any,
-    setup: Setup,
+    device: torch.device,
+    precision: str,
     encode: Callable[[EventWindow], Tensor],
-    prediction_of: Callable[[Tensor], Prediction],
+    prediction_of: Callable[[Any], Prediction],
 ) -> Recoverer:
-    """Run a recurrent network on one encoded window after the other; `prediction_of` takes its outputs of n windows."""
+    """Run a recurrent network on encoded windows; `prediction_of` takes the outputs of n windows (`unroll`)."""
 
     def predict(state: State, windows: Sequence[EventWindow]) -> tuple[State, Prediction]:
-        outputs = []
-        for window in windows:
-            with setup.autocast():
-                output, state = network(encode(window), state)
-            outputs.append(output.float())
-        return state, prediction_of(torch.stack(outputs))
+        inputs = torch.stack([encode(window) for window in windows]).to(device)
+        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
+            outputs, state = network.unroll(inputs, state)
+        return state, prediction_of(outputs)
 
-    return Recoverer(no_state, predict, network=network)
+    return Recoverer(lambda height, width: None, predict, network=network)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import torch
 
-from polarnet.events.stream import Events, concatenate, slice_time
-from polarnet.events.streaming import EventWindow
+from polarnet.events.stream import Events, slice_time
+from polarnet.events.streaming import EventWindow, join_windows
 from polarnet.methods.method import Recoverer, State, each_map, joined
 from polarnet.stokes import Prediction
 
@@ -89,8 +89,7 @@ def of_any_length(recoverer: Recoverer, trained_us: int) -> Recoverer:
         for window in windows:
             parts, recent = equal_parts(window, trained_us), _recent(state.windows, window, trained_us)
             if len(parts) == 1:
-                channels = [concatenate(of_one) for of_one in zip(*(one.channels for one in recent), strict=True)]
-                parts = [EventWindow(channels, recent[0].start_us, window.stop_us)]
+                parts = [join_windows(recent)]
             history, prediction = advance(recoverer, state.history, parts)
             state = Recent(history, recent)
             frames.append(each_map(prediction, lambda field: field[-1]))

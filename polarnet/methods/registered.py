@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from polarnet.events.representations import event_counts
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.dolp_network import METHODS as NETWORKS
-from polarnet.methods.method import Method, Recoverer, Setup, State, each_map, joined
+from polarnet.methods.method import Method, Recoverer, Setup, State
 from polarnet.methods.registration import (
     NEAR,
     Panorama,
@@ -46,18 +46,14 @@ OURS = next(method for method in NETWORKS if method.name == "ours")
 
 
 class Past(NamedTuple):
-    """State before a block of windows: that of the network, and what it was given and predicted in the latest ones."""
+    """State before a block of windows: that of the network, and what it was given in the latest ones."""
 
     inner: State
     counts: Float[Tensor, "k 8 h w"]
-    predicted: Prediction | None
-    """Maps of the same k windows; None before the first."""
     steps: Float[Tensor, " k"]
-    """Estimated change of log intensity per event in each of them."""
-    edges_us: Int64[np.ndarray, " k1"]
-    """Start of the first window and ends of all; empty before the first."""
+    """Estimated change of log intensity per event in each of these windows."""
     block: "Block | None"
-    """The latest run; None before the first."""
+    """The latest run, which ended with them; None before the first."""
 
 
 class Block(NamedTuple):
@@ -147,59 +143,54 @@ def open_registered(setup: Setup) -> Recoverer:
     network.scale.register_forward_hook(lambda module, features, scale: scales.append(scale.flatten().cpu()))
 
     def start(height: int, width: int) -> Past:
-        nothing = torch.zeros(0, 8, height, width)
-        return Past(inner.start(height, width), nothing, None, torch.zeros(0), np.zeros(0, np.int64), None)
+        return Past(inner.start(height, width), torch.zeros(0, 8, height, width), torch.zeros(0), None)
 
     def predict(past: Past, windows: Sequence[EventWindow]) -> tuple[Past, Prediction]:
         scales.clear()
-        state, parts = past.inner, []
-        at_once = inner.at_once(*past.counts.shape[-2:])
-        for k in range(0, len(windows), at_once):
-            state, part = inner.step(state, windows[k : k + at_once])
-            parts.append(part)
-        own = joined(parts)
-        counts = torch.stack([torch.cat([event_counts(one, window.length_us) for one in window.channels]).cpu()
-                              for window in windows])  # fmt: skip
-        steps = network.step * torch.cat(scales).float().mean().expand(len(windows))
-        together = own if past.predicted is None else joined([past.predicted, own])
-        edges_us = past.edges_us if past.predicted is not None else np.array([windows[0].start_us])
+        state, prediction = inner.run(past.inner, windows, inner.at_once(*past.counts.shape[-2:]))
+        own, edges_us = _maps_of(*prediction[:3]), np.array([windows[0].start_us])  # type: ignore[arg-type]
+        if past.block is not None:
+            first = past.block.own.shape[1] - len(past.counts)
+            own, edges_us = torch.cat([past.block.own[:, first:], own], dim=1), past.block.edges_us[first:]
         edges_us = np.append(edges_us, [window.stop_us for window in windows])
-        known = Past(state, torch.cat([past.counts, counts]), together, torch.cat([past.steps, steps]), edges_us, None)
-        block = registered(known, config, setup.frames)
+        new = [torch.cat([event_counts(one, window.length_us) for one in window.channels]) for window in windows]
+        counts = torch.cat([past.counts, torch.stack(new).cpu()])
+        steps = torch.cat([past.steps, network.step * torch.cat(scales).float().mean().expand(len(windows))])
+        block = registered(counts, own, edges_us, float(steps.mean()), config, setup.frames)
         if block.joint is not None or block.frames is not None:
-            own = each_map(block.at(edges_us[-len(windows) :]), lambda maps: maps.to(own.dolp.device))
-        latest = slice(max(0, len(known.counts) - config.overlap), None)
-        predicted = each_map(together, lambda maps: maps[latest])
-        return Past(state, known.counts[latest], predicted, known.steps[latest], edges_us[latest], block), own
+            prediction = block.at(edges_us[-len(windows) :])
+        latest = slice(max(0, len(counts) - config.overlap), None)
+        return Past(state, counts[latest], steps[latest], block), prediction
 
     def between(past: Past, t_us: Int64[np.ndarray, " n"]) -> Prediction:
         assert past.block is not None
         return past.block.at(t_us)
 
-    def at_once(height: int, width: int) -> int:
-        return config.windows
-
-    return Recoverer(start, predict, network=network, at_once=at_once, sees_ahead=True, between=between)
+    return Recoverer(start, predict, network=network, at_once=lambda height, width: config.windows, between=between)
 
 
-def registered(known: Past, config: RegistrationConfig, frames: StokesFrames | None = None) -> Block:
+def registered(
+    counts: Float[Tensor, "k 8 h w"],
+    own: Float[Tensor, "4 k h w"],
+    edges_us: Int64[np.ndarray, " k1"],
+    step: float,
+    config: RegistrationConfig,
+    frames: StokesFrames | None,
+) -> Block:
     """Register windows and join the network's maps with their panorama, and with the frames in this time."""
-    polarity, number = known.counts.unflatten(1, (4, 2)).permute(2, 1, 0, 3, 4).numpy()
-    counts = np.stack([number + polarity, number - polarity], axis=1) / 2
-    panorama = register(counts, config) if len(counts[0, 0]) >= FEWEST else None
-    frames = frames and frames.between(int(known.edges_us[0]), int(known.edges_us[-1]))
-    if frames is not None and not len(frames.t_us):
-        frames = None
-    assert known.predicted is not None
-    own = _maps_of(*(field.cpu().float() for field in known.predicted[:3] if field is not None))
-    joint = None if panorama is None else _joint(own, panorama, float(known.steps.mean()), config)
-    height, width = number.shape[-2:]
-    panorama = panorama or at_rest(height, width, len(known.edges_us))
-    shown = None if frames is None else _shown(frames, panorama, known.edges_us)
+    polarity, number = counts.unflatten(1, (4, 2)).permute(2, 1, 0, 3, 4).numpy()
+    events = np.stack([number + polarity, number - polarity], axis=1) / 2
+    panorama = register(events, config) if len(counts) >= FEWEST else None
+    frames = frames and frames.between(int(edges_us[0]), int(edges_us[-1]))
+    frames = frames if frames and len(frames.t_us) else None
+    joint = None if panorama is None else _joint(own, panorama, step, config)
+    height, width = own.shape[-2:]
+    panorama = panorama or at_rest(height, width, len(edges_us))
+    shown = None if frames is None else _shown(frames, panorama, edges_us)
     all_of_it, nothing = config.unexplained
-    left = torch.from_numpy(unexplained(panorama, counts))
+    left = torch.from_numpy(unexplained(panorama, events))
     explained = ((nothing - left) / (nothing - all_of_it)).clamp(0, 1)
-    return Block(own, known.edges_us, panorama.x, panorama.y, joint, explained, frames, shown)
+    return Block(own, edges_us, panorama.x, panorama.y, joint, explained, frames, shown)
 
 
 def _maps_of(dolp: Tensor, aolp: Tensor, log_variance: Tensor) -> Float[Tensor, "4 k h w"]:

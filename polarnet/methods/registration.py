@@ -86,16 +86,16 @@ class _Pixels(NamedTuple):
     """ON and OFF events so far."""
     series: Float32[np.ndarray, "4 3 k h w"]
     """Orthonormal series of each pixel (`_weights`)."""
-    smoothness: float
-    """Weight of the squared slopes of the images' mean, and of their contrasts."""
-    contrast_smoothness: float
+    smoothness: Float32[np.ndarray, " 4"]
+    """Weights of the squared slopes of the rows of MIXING: the images' mean, and their contrasts."""
 
 
 def _pixels(events: np.ndarray, config: RegistrationConfig, mismatch: float, rounding: float) -> _Pixels:
     """The problem of pixels whose mismatch and rounding are smaller by factors."""
     series = _weights(events, mismatch * config.mismatch, rounding * config.rounding)
-    smoothness = rounding * config.smoothness
-    return _Pixels(events, series, smoothness, smoothness * config.contrast_smoothness)
+    mean = rounding * config.smoothness
+    contrast = mean * config.contrast_smoothness
+    return _Pixels(events, series, np.array([mean, contrast, contrast, contrast], np.float32))
 
 
 def register(counts: Float32[np.ndarray, "4 2 k h w"], config: RegistrationConfig) -> Panorama | None:
@@ -207,10 +207,9 @@ def _changes(events: np.ndarray) -> np.ndarray:
     return events[:, 0] - events[:, 1]
 
 
-def _solved(pixels: "_Pixels", x: np.ndarray, y: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
+def _solved(pixels: _Pixels, x: np.ndarray, y: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
     """Conjugate gradients for the images, with the coverage as preconditioner."""
-    events, series, mean, contrast = pixels
-    weights = np.array([mean, contrast, contrast, contrast], np.float32)
+    events, series, weights = pixels
     seen = _coverage(x, y, events.shape[-2:], start.shape[-2:])
     inverse = 1 / (seen + weights.sum() + np.float32(1e-5))
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from polarnet.events.stream import Events, slice_time
 from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow, windows_of
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.methods.method import State, each_map, joined
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Prediction
@@ -67,9 +66,6 @@ def recover(
     recoverer = dolp_recoverer(
         *load_network(weights or shipped_weights()), device, thresholds=thresholds, binning=binning
     )
-    state: State = recoverer.start(events[0].height, events[0].width)
-    size, parts = recoverer.at_once(events[0].height, events[0].width), []
-    for first in range(0, len(windows), size):
-        state, prediction = recoverer.step(state, windows[first : first + size])
-        parts.append(each_map(prediction, Tensor.cpu))
-    return Recovery(t_us[1:], joined(parts))
+    size = events[0].height, events[0].width
+    _, prediction = recoverer.run(recoverer.start(*size), windows, recoverer.at_once(*size))
+    return Recovery(t_us[1:], prediction)

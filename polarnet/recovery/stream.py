@@ -1,7 +1,9 @@
 """`polarnet recover`: frames of DoLP and AoLP from event-camera files or a running camera."""
 
+import itertools
 import math
 import operator
+import os
 import statistics
 import time
 from array import array
@@ -9,9 +11,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from queue import Queue
+from threading import Thread
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from polarnet.events.streaming import (
@@ -28,7 +33,6 @@ from polarnet.methods.overlap import advance, begin, equal_parts, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
 from polarnet.recordings.arrangements import Input, Piece
-from polarnet.recovery.ahead import Ahead
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import tune
 from polarnet.stokes import Prediction
@@ -36,6 +40,8 @@ from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
+Item = TypeVar("Item")
+NICE = 10  # of the reading thread: those of a network wait for each other, so it slows down most where one gives way
 FILE_PIECES, LIVE_PIECES = 2, 512  # most pieces read ahead: a file has pieces of a million events, a pipe small ones
 MAX_LATENCY_S = 0.15  # from the arrival of a window's last event to its frame, where that can be reached
 MAX_BACKLOG_US = 1_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
@@ -89,21 +95,70 @@ def open_method(
     if reason := why_absent(method, setup):
         raise ValueError(f"--method {method.name}: {reason}")
     recoverer = method.open(setup)
-    whole = ", over the whole recording (--method ours: only the past)" if recoverer.sees_ahead else ""
+    whole = ", over the whole recording (--method ours: only the past)" if recoverer.between else ""
     if setup.frames is not None:
         whole += f", with {len(setup.frames.t_us)} frames of the camera"
     return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
 
 
-def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: int | None = None) -> Iterator[Frame]:
+class Ahead(Generic[Item]):
+    """The items of an iterable in their order, taken from it by another thread, at most `most` in advance.
+
+    An exception of the iterable is raised after the items before it. As a context manager it lets the thread end.
+    """
+
+    def __init__(self, items: Iterable[Item], most: int):
+        self._queue: Queue[tuple[list[Item], BaseException | None]] = Queue(most)
+        self._end: BaseException | None = None
+        self._stopped = False
+        Thread(target=self._fill, args=[items], daemon=True).start()  # daemon: a camera may deliver nothing any more
+
+    def __enter__(self) -> "Ahead[Item]":
+        return self
+
+    def __exit__(self, *problem: object) -> None:
+        self._stopped = True
+        while not self._queue.empty():  # the thread may wait for room
+            self._queue.get()
+
+    def __iter__(self) -> Iterator[Item]:
+        while items := self.take():
+            yield from items
+
+    def take(self, *, wait: bool = True) -> list[Item]:
+        """The items that are ready, `most` at most; `wait` for one if there is none. Empty at the end."""
+        items: list[Item] = []
+        most = self._queue.maxsize
+        while self._end is None and len(items) < most and ((wait and not items) or not self._queue.empty()):
+            more, self._end = self._queue.get()
+            items += more
+        if self._end is not None and wait and not items and not isinstance(self._end, StopIteration):
+            raise self._end
+        return items
+
+    def _fill(self, items: Iterable[Item]) -> None:
+        torch.set_num_threads(1)  # more would put those of the network to sleep between operations
+        os.nice(NICE)  # Linux: of this thread alone
+        end: BaseException = StopIteration()
+        try:
+            for item in items:
+                self._queue.put(([item], None))
+                if self._stopped:
+                    return
+        except BaseException as error:
+            end = error
+        self._queue.put(([], end))
+
+
+def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator[Frame]:
     """Yield a frame for each window, of live input as soon as the window's last event has arrived.
 
     If the rule has a step and the method has frames between the ends of its windows, windows follow each other, and
     each is cut into equal parts of about that step, with a frame at the end of each part.
 
     Another thread reads the input ahead. Windows that are already available, such as those of a file, are processed in
-    runs of up to `at_once` windows (default: `Recoverer.at_once`). If a live source does not wait and the processor is
-    too slow for it, the windows that have arrived are joined to one. ValueError if no window is complete.
+    runs of up to `Recoverer.at_once` windows, overlapping ones one by one. If a live source does not wait and the
+    processor is too slow for it, the windows that have arrived are joined to one. ValueError if no window is complete.
     """
     if min(source.height, source.width) < 2:  # the shipped network's DoLP of one row is not finite
         raise ValueError(
@@ -115,7 +170,8 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
     windows_of = replace(rule, step_us=None) if part_us else rule
     cutter = WindowCutter(windows_of, source.height, source.width, source.channels)
     history = begin(recoverer, source.height, source.width)
-    most = at_once or recoverer.at_once(source.height, source.width)
+    follow = windows_of.step_us in (None, windows_of.length_us)
+    most = recoverer.at_once(source.height, source.width) if follow else 1
     arrived: deque[float] = deque()  # when the last events of the windows that have no frame yet came
     until_us = number = 0
 
@@ -128,8 +184,12 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer, at_once: in
                 yield window
 
     with Ahead(source.pieces, FILE_PIECES if source.waits else LIVE_PIECES) as ahead:
-        live = _live_runs(ahead.take, windows, arrived, most, source.waits)
-        for run in live if source.live else runs_of(windows(ahead), most):
+        if source.live:
+            runs = _live_runs(ahead.take, windows, arrived, most, source.waits)
+        else:
+            every = windows(ahead)
+            runs = iter(lambda: list(itertools.islice(every, most)), [])
+        for run in runs:
             start = time.perf_counter()
             history, prediction = advance(recoverer, history, run)
             maps = each_map(prediction, Tensor.cpu)
@@ -175,8 +235,8 @@ def _live_runs(
             late = time.perf_counter() - arrived[0] + len(waiting) * usual_s > MAX_LATENCY_S
             if late and usual_s > MAX_LOAD * between_us * 1e-6:
                 waiting = [join_windows(waiting)]
-        if run := next(runs_of(waiting, most), None):
-            waiting = waiting[len(run) :]
+        if waiting:
+            run, waiting = waiting[:most], waiting[most:]
             start = time.perf_counter()
             yield run
             work_s.append((time.perf_counter() - start) / len(run))
@@ -189,18 +249,6 @@ def _check_finite(frame: Prediction, window: EventWindow) -> None:
             f"the DoLP of the window from {window.start_us} to {window.stop_us} us is not finite: the weights or the "
             "thresholds are no working ones; the frames before it are whole"
         )
-
-
-def runs_of(windows: Iterable[EventWindow], most: int) -> Iterator[list[EventWindow]]:
-    """Group adjacent windows, which neither overlap nor leave gaps, into batches of up to `most`."""
-    run: list[EventWindow] = []
-    for window in windows:
-        if run and (len(run) == most or run[-1].stop_us != window.start_us):
-            yield run
-            run = []
-        run.append(window)
-    if run:
-        yield run
 
 
 def recover(
@@ -267,8 +315,7 @@ class TruthScores:
         for frame in frames:
             if self._truth.has(frame.window.stop_us, MAX_GAP * frame.window.length_us):
                 true = self._truth.at(frame.window.stop_us)
-                aolp = frame.prediction.aolp
-                batch = Prediction(frame.prediction.dolp[None], None if aolp is None else aolp[None])
+                batch = each_map(frame.prediction, operator.itemgetter(None))
                 valid = None if true.valid is None else true.valid[None]
                 scores = frame_scores(batch, true.dolp[None], true.aolp[None], valid)
                 self._scores.append({name: float(values) for name, values in scores.items()})

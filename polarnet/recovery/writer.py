@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,20 +34,14 @@ MAX_QUEUED = 64  # frames waiting to be written
 FEW_CORES = 2  # up to this number, a live camera's network needs all cores: a writing thread delays every operation
 ANGLE = "AoLP (hue), DoLP (saturation)"  # caption
 RECOVERED = "recovered"  # source of the maps on the page
+Maps = dict[tuple[str, Kind], UInt8[Tensor, "h w"]]
+"""Maps of a frame as bytes (`polarnet.storage.panels`), by source and kind."""
 ZARR_CONVENTIONS = {
     "t_us": "time of the frame, end of its window, microseconds from the first event",
     "dolp": "degree of linear polarization, divided by 65535",
     "aolp": "angle of linear polarization in radians in [0, pi), divided by 65536 and times pi",
     "log_variance": "natural logarithm of the variance that the network expects of its own DoLP",
 }
-
-
-class Picture(NamedTuple):
-    """The maps of one frame, and the end of its window."""
-
-    t_us: int
-    maps: Mapping[tuple[str, Kind], UInt8[Tensor, "h w"]]
-    """The maps as bytes (`polarnet.storage.panels`) by source and kind, for the page."""
 
 
 class RecoveryWriter:
@@ -71,7 +64,7 @@ class RecoveryWriter:
         self._reconstruct, self._truth = reconstruct, truth
         self._reconstructed: State = None
         self.frames = self.stop_us = 0
-        self._pictures: list[Picture] = []  # evenly spread over a stream of unknown length
+        self._pictures: dict[int, Maps] = {}  # by end of the window; evenly spread over a stream of unknown length
         self._every = 1
         self._sheet: Sheet | None = None
         self._latest: tuple[EventWindow, Prediction, Float[Tensor, "h w"]] | None = None
@@ -126,9 +119,9 @@ class RecoveryWriter:
             self._video.add(self._labelled(window, prediction, events))
         if sampled:
             true = None if self._truth is None else self._truth.at(window.stop_us)
-            self._pictures.append(Picture(window.stop_us, _byte_maps(events, prediction, true)))
+            self._pictures[window.stop_us] = _byte_maps(events, prediction, true)
             if len(self._pictures) > 2 * MAX_FRAMES:
-                self._pictures, self._every = self._pictures[::2], 2 * self._every
+                self._pictures, self._every = dict([*self._pictures.items()][::2]), 2 * self._every
 
     def _labelled(
         self, window: EventWindow, prediction: Prediction, events: Float[Tensor, "h w"]
@@ -173,9 +166,7 @@ def _quantised(steps: Tensor) -> UInt16[np.ndarray, "h w"]:
     return steps.round().clamp(0, FRACTION_STEPS).numpy().astype(np.uint16)
 
 
-def _byte_maps(
-    events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None
-) -> dict[tuple[str, Kind], UInt8[Tensor, "h w"]]:
+def _byte_maps(events: Float[Tensor, "h w"], prediction: Prediction, true: Polarization | None) -> Maps:
     """The maps of a frame and of its truth, if that is known, as bytes by source and kind."""
     values: dict[tuple[str, Kind], Tensor] = {("Events", "events"): events}
     if true is not None:
@@ -188,8 +179,9 @@ def _byte_maps(
     return {name: TO_BYTES[name[1]](one) for name, one in values.items()}
 
 
-def _film(source: str, pictures: Sequence[Picture]) -> Film:
+def _film(source: str, pictures: Mapping[int, Maps]) -> Film:
     """The film of a recovery for the page's player; the truth if every frame has it."""
-    names = [name for name in pictures[0].maps if all(name in one.maps for one in pictures)]
-    maps = [Map(*name, torch.stack([one.maps[name] for one in pictures]).numpy()) for name in names]
-    return Film(source, [one.t_us for one in pictures], maps)
+    first, *others = pictures.values()
+    names = [name for name in first if all(name in one for one in others)]
+    maps = [Map(*name, torch.stack([one[name] for one in pictures.values()]).numpy()) for name in names]
+    return Film(source, [*pictures], maps)

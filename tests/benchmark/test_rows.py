@@ -6,8 +6,7 @@ import torch
 from method_fixtures import WITH_WEIGHTS_HERE
 from torch import nn
 
-from polarnet.benchmark.cost import cost_of, first_windows
-from polarnet.benchmark.rows import available, opened, predictions_of, weights_used
+from polarnet.benchmark.rows import available, cost_of, first_windows, opened, predictions_of, weights_used
 from polarnet.events.stream import Events
 from polarnet.methods import METHODS, ROWS
 from polarnet.methods.method import Method, Recoverer
@@ -111,5 +110,5 @@ def test_a_recording_is_cut_after_whole_windows(sequence):
     cut = first_windows(sequence, 2)
     assert cut.t_us.tolist() == [0, 1000, 2000]
     assert len(cut.dolp) == len(cut.s0) == 2
-    assert [window.stop_us for window in cut.windows] == [1000, 2000]
+    assert [window.stop_us for window in cut.windows()] == [1000, 2000]
     assert first_windows(sequence, 99).t_us.tolist() == sequence.t_us.tolist()

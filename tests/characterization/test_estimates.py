@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from event_fixtures import events_of
 
-from polarnet.characterization.flicker import Flicker, Increments, flicker_cycle, thresholds_without_leak
-from polarnet.characterization.intervals import undisturbed
+from polarnet.characterization.flicker import Flicker, Increments, flicker_cycle, thresholds_without_leak, undisturbed
 from polarnet.characterization.noise import (
     estimate_noise,
     hot_under_constant_light,

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from polarnet.characterization.fit import fit_sensor
-from polarnet.characterization.flicker import Flicker, FlickerRecording
-from polarnet.characterization.intervals import piled_up_us
+from polarnet.characterization.fit import fit_sensor, piled_up_us
+from polarnet.characterization.flicker import Flicker
 from polarnet.events.stream import Events
 from polarnet.recordings.noise import event_counts
 from polarnet.simulation.emulator import emulate
@@ -36,14 +35,14 @@ def static():
 
 
 @pytest.fixture(scope="module")
-def flickers() -> list[FlickerRecording]:
+def flickers() -> list[tuple[Events, Flicker]]:
     """Two flickers of unknown phase."""
     recordings = []
     for frequency_hz, stop_us in ((2.0, 4e6), (20.0, 2e6)):
         flicker = Flicker(100.0, 0.8, frequency_hz)
         t_us = np.linspace(0, stop_us, round(64e-6 * stop_us * frequency_hz) + 1)  # 64 steps a cycle
         light = flicker.light(2e-6 * np.pi * frequency_hz * t_us)
-        recordings.append(FlickerRecording(f"{frequency_hz} Hz", emulated(np.roll(light, 321), t_us), flicker))
+        recordings.append((emulated(np.roll(light, 321), t_us), flicker))
     return recordings
 
 
@@ -77,7 +76,7 @@ def test_what_the_recordings_do_not_show_is_missing(static, flickers):
 
 def test_a_flicker_given_as_static_is_noted_and_another_sensor_refused(fit, flickers, static):
     assert not any("constant" in note for note in fit.notes)
-    assert "was not constant" in fit_sensor(flickers[0].events, 200.0, [], SENSORS["default"]).notes[0]
+    assert "was not constant" in fit_sensor(flickers[0][0], 200.0, [], SENSORS["default"]).notes[0]
     with pytest.raises(ValueError, match="one sensor"):
         fit_sensor(Events.empty(8, 8), 200.0, flickers, SENSORS["default"])
 

@@ -51,7 +51,7 @@ def open_method(make_setup):
 
 @pytest.mark.parametrize("name", [name for name in METHODS if name in WITH_WEIGHTS_HERE])
 def test_every_method_gives_a_frame_a_window_alike_at_once_and_one_by_one(name, sequence, open_method):
-    recoverer, windows = open_method(name), sequence.windows
+    recoverer, windows = open_method(name), sequence.windows()
     together = recovered(recoverer, windows)
     assert together.dolp.shape == sequence.dolp.shape
     assert together.dolp.dtype == torch.float32
@@ -72,14 +72,14 @@ def test_every_method_gives_a_frame_a_window_alike_at_once_and_one_by_one(name, 
 def test_dolp_is_clamped_for_every_method_and_more_is_handed_on_where_there_is_more(sequence):
     wild = torch.linspace(-1, 2, sequence.dolp.numel()).view_as(sequence.dolp)
     recoverer = Recoverer(lambda height, width: None, lambda state, windows: (state, Prediction(wild)))
-    assert torch.equal(recovered(recoverer, sequence.windows).dolp, wild.clamp(0, 1))
+    assert torch.equal(recovered(recoverer, sequence.windows()).dolp, wild.clamp(0, 1))
 
     class Sure(torch.nn.Module):
         def unroll(self, inputs, state):
             maps = inputs[:, :, 0]
             return Prediction(3 + maps, 0.5 + 0 * maps, maps), [maps]
 
-    prediction = recovered(dolp_recoverer(Sure(), {"representation": "voxel_grid"}), sequence.windows[:1])
+    prediction = recovered(dolp_recoverer(Sure(), {"representation": "voxel_grid"}), sequence.windows()[:1])
     assert prediction.dolp.max() <= 1
     assert prediction.aolp.unique().tolist() == [0.5]
     assert prediction.log_variance.shape == (1, 18, 20)
@@ -90,7 +90,7 @@ def test_cf_of_one_event_behind_one_polarizer_which_counts_from_the_window_that_
     one = Events(torch.tensor([1000]), column, row, torch.ones(1, dtype=torch.int8), 18, 20)
     silent = Events.empty(18, 20)
     lit = dataclasses.replace(sequence, events=[one, silent, silent, silent])
-    dolp = recovered(open_method("cf"), lit.windows).dolp
+    dolp = recovered(open_method("cf"), lit.windows()).dolp
     dark = 0.1 / 1.3  # what a pixel without events shows: exp(0) - 1 = 0, and -0.1 ... 1.2 is shown as 0 ... 1
     bright = [(math.expm1(0.1 * math.exp(-math.pi * t)) + 0.1) / 1.3 for t in (1e-3, 2e-3, 3e-3)]
     expected = [0.0, *((b - dark) / (b + dark) for b in bright)]  # at 1000 us it lies in [1000, 2000), not in [0, 1000)
@@ -102,7 +102,7 @@ def test_cf_of_one_event_behind_one_polarizer_which_counts_from_the_window_that_
 @pytest.mark.parametrize("name", RECONSTRUCTING)
 def test_reconstructions_treat_the_four_polarizers_alike(name, sequence, open_method):
     turned = dataclasses.replace(sequence, events=[*sequence.events[1:], sequence.events[0]])
-    straight, shifted = (recovered(open_method(name), one.windows).intensities for one in (sequence, turned))
+    straight, shifted = (recovered(open_method(name), one.windows()).intensities for one in (sequence, turned))
     assert straight.shape == (4, 4, 18, 20)
     assert 0 <= straight.min() < straight.max() <= 1
     torch.testing.assert_close(shifted, straight.roll(-1, dims=1))
@@ -123,9 +123,9 @@ def test_solved_gains_undo_what_a_method_left_unknown(sequence, make_setup):
     method = reconstructing(true * torch.tensor([1.5, 0.7, 1.0, 0.8]).view(4, 1, 1))
     setup = make_setup("cf")
     assert [METHODS[f"{name}+gain"].section for name in RECONSTRUCTING] == RECONSTRUCTING
-    solved = recovered(with_gain(method).open(setup), sequence.windows)
+    solved = recovered(with_gain(method).open(setup), sequence.windows())
     torch.testing.assert_close(solved.dolp, dolp, atol=1e-3, rtol=0)
-    assert not torch.allclose(recovered(method.open(setup), sequence.windows).dolp, dolp, atol=0.1)
+    assert not torch.allclose(recovered(method.open(setup), sequence.windows()).dolp, dolp, atol=0.1)
 
 
 def test_published_networks_are_sharpened_and_firenet_plus_sees_plain_voxels(sequence, make_setup, open_method):
@@ -134,10 +134,10 @@ def test_published_networks_are_sharpened_and_firenet_plus_sees_plain_voxels(seq
     grids = encode_windows(sequence.events, sequence.t_us, lambda events, _: voxel_grid(events, 5)).unflatten(1, (4, 5))
     with torch.no_grad():
         raw, _ = network.unroll(grids)
-    intensities = recovered(open_method("firenetplus_published"), sequence.windows).intensities
+    intensities = recovered(open_method("firenetplus_published"), sequence.windows()).intensities
     torch.testing.assert_close(intensities, sharper(raw))
     (normalised, _) = intensity_methods("m", "m", "#000000", {"firenet": FireNet}, sharpened=True)
-    assert not torch.allclose(intensities, recovered(normalised.open(setup), sequence.windows).intensities)
+    assert not torch.allclose(intensities, recovered(normalised.open(setup), sequence.windows()).intensities)
 
 
 def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, open_method, checkpoints):
@@ -145,13 +145,13 @@ def test_e2p_sees_the_channels_as_a_mosaic_and_carries_its_state_on(sequence, op
     network = load_baseline({"e2p": E2p}, checkpoints["e2p"])
     with torch.no_grad():
         maps, _ = network.unroll(interleaved(grids.unflatten(1, (4, 5)))[:, None])
-    prediction = recovered(open_method("e2p"), sequence.windows)
+    prediction = recovered(open_method("e2p"), sequence.windows())
     torch.testing.assert_close(prediction.dolp, maps[:, 0, 2].clamp(0, 1))
     assert prediction.aolp is not None
 
 
 def test_an_event_of_half_the_threshold_counts_half(sequence):
-    events = sequence.windows[0].channels[0]
+    events = sequence.windows()[0].channels[0]
     polarity, count = event_counts(events, 1)
     assert torch.equal(weighted_counts((1.0, 1.0))(events, 1), torch.stack([polarity, count]))
     change, steps = weighted_counts((0.5, 1.0))(events, 1)
@@ -165,7 +165,7 @@ def stokes_unet(project_root):
 
 
 def test_a_network_that_is_told_thresholds_or_blocks_of_pixels_uses_them(sequence, stokes_unet, project_root):
-    given = recovered(dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.4)), sequence.windows[:1])
+    given = recovered(dolp_recoverer(stokes_unet, COUNTS, thresholds=(0.1, 0.4)), sequence.windows()[:1])
     assert stokes_unet.scale.given == pytest.approx(0.2 / stokes_unet.step)
     inputs = encode_windows(sequence.events, sequence.t_us[:2], weighted_counts((0.5, 2.0)))[:, None]
     with torch.no_grad():
@@ -173,8 +173,8 @@ def test_a_network_that_is_told_thresholds_or_blocks_of_pixels_uses_them(sequenc
     coarse = StokesUNet(dataclasses.replace(load(project_root).networks.polarnet, binning=2))
     coarse.load_state_dict(stokes_unet.state_dict())
     stokes_unet.scale.given = None
-    told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows)
-    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows).dolp)
+    told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows())
+    assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows()).dolp)
 
 
 @pytest.mark.parametrize(("network", "option", "words"), [

@@ -23,7 +23,7 @@ def ours(make_setup):
 
 
 def test_windows_at_once_must_follow_each_other_and_joined_ones_hold_each_event_once(sequence, ours):
-    windows = sequence.windows
+    windows = sequence.windows()
     with pytest.raises(ValueError, match=r"follow each other, got \[\(0, 1000\), \(2000, 3000\)\] us"):
         advance(ours, begin(ours, 18, 20), [windows[0], windows[2]])
     overlapping = windows_of(sequence, WindowRule(WINDOW_US, 500))
@@ -126,5 +126,5 @@ def test_every_event_counts_once_in_the_series_that_ends_with_a_window_and_windo
         state, prediction = any_length.step(state, [window])
         frames.append(prediction.dolp)
     torch.testing.assert_close(torch.cat(frames), together.dolp)
-    _, whole = ours.step(ours.start(18, 20), sequence.windows)
+    _, whole = ours.step(ours.start(18, 20), sequence.windows())
     torch.testing.assert_close(together.dolp[3::4], whole.dolp, atol=1e-4, rtol=1e-4)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from part_fixtures import files_of
 
-from polarnet.benchmark import cost
+from polarnet.benchmark import rows
 from polarnet.config.origins import pipeline
 from polarnet.config.sweep import sweep_points
 from polarnet.config.tree import load
@@ -58,7 +58,7 @@ def run_pipeline(root: Path, data: Path, *overrides: str) -> None:
 
 def save_time() -> None:
     """Measure the cost of a row on one window, which else takes longer than the scores; fork workers, if any."""
-    cost.COUNTED_WINDOWS = cost.TIMED_WINDOWS = cost.REPEATS = 1
+    rows.COUNTED_WINDOWS = rows.TIMED_WINDOWS = rows.REPEATS = 1
     preloaded.fork_workers_too()
 
 

@@ -13,8 +13,7 @@ from event_fixtures import events_of
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.method import Recoverer
 from polarnet.recordings.arrangements import Piece
-from polarnet.recovery.ahead import Ahead
-from polarnet.recovery.stream import MAX_LATENCY_S, Input, frames_of, recover
+from polarnet.recovery.stream import MAX_LATENCY_S, Ahead, Input, frames_of, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import Prediction
 
