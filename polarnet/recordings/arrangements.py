@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, shifted, slice_count
+from polarnet.events.stream import Events, shifted, slice_count, split_mosaic
 from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
 from polarnet.recordings.source import Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
