@@ -93,10 +93,6 @@ def _typed(block: Block) -> Block:
     return Block(np.ascontiguousarray(block.t, np.int64), x, y, np.where(block.p == 1, np.int8(1), np.int8(-1)))
 
 
-def _joined(blocks: list[Block]) -> Block:
-    return joined([block for block in blocks if len(block.t)] or [NOTHING])
-
-
 class Clock:
     """Puts events in time order and leaves out those with wrong times: the one rule for files and live input.
 
@@ -128,7 +124,7 @@ class Clock:
         `final` judges all times by the events at hand: at the end, and where live input makes a pause.
         """
         shifted = block._replace(t=block.t + self._shift_us) if self._shift_us else block
-        rest = _joined([self._unjudged, shifted])
+        rest = joined([self._unjudged, shifted])
         accepted, reset = [self._held], True
         while reset:
             judged, reset, which = self._judge(rest, sum(len(one.t) for one in accepted), final)
@@ -147,11 +143,11 @@ class Clock:
                 rest = self._set_anew(rest)
             else:
                 self._settled = True
-                yield self._ready(_joined(accepted), final=True)
+                yield self._ready(joined(accepted), final=True)
                 raise RecordingError(self._refusal(rest))
         self._unjudged = rest
         self._settled |= final or self._judged > MAX_STALE
-        yield self._ready(_joined(accepted), final)
+        yield self._ready(joined(accepted), final)
 
     def _judge(self, block: Block, before: int, final: bool) -> tuple[int, bool, np.ndarray | slice]:
         """Number of judged events, whether the next one sets the clock anew, and which of them to keep."""

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Int64, UInt8, UInt16
 
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
+from polarnet.recordings.content import start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 HEIGHT, WIDTH = 800, 1280

@@ -13,17 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    byte_blocks,
-    start_of,
-    unpacked,
-)
+from polarnet.recordings.content import byte_blocks, start_of, unpacked
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own

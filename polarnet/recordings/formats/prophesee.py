@@ -15,17 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    header_lines,
-    unwrapped,
-    word_blocks,
-)
+from polarnet.recordings.content import header_lines, unwrapped, word_blocks
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 PREFIX, LAST_LINE = b"% ", b"% end"

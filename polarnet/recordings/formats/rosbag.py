@@ -16,7 +16,7 @@ import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
 from polarnet.recordings.formats.prophesee import EVT_START, evt_block
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source
 from polarnet.terminal.installation import installation
 
 SUFFIXES = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3": ".db3"}
@@ -51,7 +51,7 @@ def open_rosbag(path: Path, choices: Choices) -> Source:
                 f"{path.name}: expected a topic of EventArray (dvs_msgs or prophesee_event_msgs) or EventPacket "
                 f"(event_camera_msgs), got only {others[:300]}"
             )
-        topic = chosen_part(path, choices.part, topics, "topic of events")
+        topic = choices.part_of(path.name, topics, "topic of events")
         first = next(_messages(bag, topic, Counts()), None)
     height, width = (None, None) if first is None else first[:2]
 
