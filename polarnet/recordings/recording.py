@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import Events
+from polarnet.recordings.content import GZIP, ZIP, start_of
 from polarnet.recordings.formats import aedat, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
-from polarnet.recordings.content import GZIP, ZIP, start_of
 from polarnet.recordings.source import REPAIRS, Blocks, CameraFrames, Choices, Counts, RecordingError, Source, cut
 
 CHUNK_EVENTS = 2**20
@@ -199,11 +199,10 @@ def is_recording(path: Path) -> bool:
 
 def detect_format(path: str | os.PathLike[str]) -> str:
     """Detect the format, a key of FORMATS, from a file's first bytes; RecordingError where none matches."""
-    path, head = Path(path), b""
-    if path.is_file():
-        head = start_of(path, lines.HEAD_BYTES)
-        if not head:
-            raise RecordingError(f"{path.name}: the file is empty")
+    path = Path(path)
+    head = start_of(path, lines.HEAD_BYTES) if path.is_file() else b""
+    if path.is_file() and not head:
+        raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
         if (name == "rosbag" or head) and form.matches(path, head):  # a bag may be a folder
             return name
