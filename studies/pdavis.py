@@ -19,8 +19,7 @@ import zarr
 from jaxtyping import Int64, UInt8
 
 from polarnet.cli import main as polarnet
-from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, join_mosaic
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb, write_png

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
-from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events, slice_count
+from polarnet.events.stream import Events, places_of, slice_count
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.recordings.formats import aedat, celex5
 from polarnet.recordings.formats.hdf5 import LAYOUTS

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int64, UInt16
 
-from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, over_time
+from polarnet.captures.dot import EVENT_CAPTURES, INTENSITY_CAPTURES, IntensityCapture, RecordingsConfig, Target
 from polarnet.events.intervals import Intervals, by_pixel, intervals_of
 from polarnet.events.stream import Events, crop
 from polarnet.recordings.source import RecordingError
@@ -150,29 +150,18 @@ class Alignment(NamedTuple):
     """Root mean square of I0 - I45 + I90 - I135 divided by that of the mean intensity, with these starts."""
 
 
-def refined_starts(
-    starts: Mapping[str, int],
-    events: Mapping[str, Events],
-    intensities: Mapping[str, IntensityCapture],
-    config: RecordingsConfig,
-    given: Mapping[str, int],
-) -> Alignment:
-    """Refine the landmark's starts to less than a frame interval; starts `given` by hand stay unchanged.
+def refined_starts(target: Target, starts: Mapping[str, int], config: RecordingsConfig) -> Alignment:
+    """Refine the landmark's starts to less than a frame interval; starts given by hand stay unchanged.
 
     Time 0 of the common clock stays: the start times of the four event captures change by 0 on average.
     """
-    lags = [
-        _lag(events[e], starts[e], intensities[i], starts[i], config)
-        for e, i in zip(EVENT_CAPTURES, INTENSITY_CAPTURES, strict=True)
-    ]
+    pairs = list(zip(EVENT_CAPTURES, INTENSITY_CAPTURES, strict=True))
+    lags = [_lag(target.events[e], starts[e], target.intensities[i], starts[i], config) for e, i in pairs]
     picture_us = np.array([starts[i] for i in INTENSITY_CAPTURES]) + [lag.lag_us for lag in lags]
-    captures = [intensities[i] for i in INTENSITY_CAPTURES]
-    shifts, residual = redundancy_shifts(captures, picture_us, config)
-    refined = dict(starts)
-    for polarizer, (e, i) in enumerate(zip(EVENT_CAPTURES, INTENSITY_CAPTURES, strict=True)):
-        refined[i] = round(picture_us[polarizer] + shifts[polarizer])
-        refined[e] = round(starts[e] + shifts[polarizer])
-    return Alignment({**refined, **given}, lags, residual)
+    shifts, residual = redundancy_shifts([target.intensities[i] for i in INTENSITY_CAPTURES], picture_us, config)
+    refined = {i: round(start + shift) for i, start, shift in zip(INTENSITY_CAPTURES, picture_us, shifts, strict=True)}
+    refined |= {e: round(starts[e] + shift) for e, shift in zip(EVENT_CAPTURES, shifts, strict=True)}
+    return Alignment({**starts, **refined, **target.given}, lags, residual)
 
 
 def redundancy_shifts(
@@ -184,7 +173,7 @@ def redundancy_shifts(
     determine, because all four captures see the same, stay near 0.
     """
     lines = [
-        over_time(capture, start, config, _pictures_after(capture, start))
+        capture.since(start, config, _pictures_after(capture, start))
         for capture, start in zip(captures, start_us.tolist(), strict=True)
     ]
     slopes_of = [line.derivative() for line in lines]

@@ -14,10 +14,11 @@ from jaxtyping import Float32, Float64, Int64, UInt16
 from pydantic import Field, PositiveFloat, PositiveInt, StrictInt, TypeAdapter
 from torch import Tensor
 
-from polarnet.events.stream import Events, concatenate, crop
+from polarnet.events.stream import Events, crop
 from polarnet.pictures.clips import TIMES_FILE, VIDEOS, ClipOptions, check_times, open_clip, times_from_file
 from polarnet.recordings.formats.celex5 import Picture, celex5_pictures
-from polarnet.recordings.recording import open_recording
+from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
+from polarnet.recordings.recording import read_recording
 from polarnet.recordings.source import RecordingError
 from polarnet.runtime.sections import one_of, section
 from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -81,6 +82,40 @@ class IntensityCapture(NamedTuple):
     region: Float64[np.ndarray, " n"]
     """Mean in the landmark's region, 0 to 255."""
 
+    def since(self, start_us: float | int, config: RecordingsConfig, chosen: slice = slice(None)) -> Any:
+        """The reduced pictures as a function of the time since `start_us`: linear between two, and beyond them."""
+        from scipy.interpolate import make_interp_spline  # half a second, which every stage would pay
+
+        pictures = np.stack([reduced(picture, config) for picture in self.pictures[chosen]])
+        return make_interp_spline(self.t_us[chosen] - start_us, pictures, k=1)
+
+
+class Target(NamedTuple):
+    """The eight captures of one target, each by its own clock."""
+
+    name: str
+    events: Mapping[str, Events]
+    """Events without those of hot pixels."""
+    hot: Mapping[str, int]
+    """Number of hot pixels in each event capture."""
+    intensities: Mapping[str, IntensityCapture]
+    given: Mapping[str, int]
+    """Start times set by hand."""
+
+
+def read_target(folder: Path, config: RecordingsConfig) -> Target:
+    """The captures in a target's folder; RecordingError where a file is missing or damaged."""
+    files, clean, hot = find_captures(folder), {}, {}
+    for capture in EVENT_CAPTURES:
+        events = read_event_capture(files[capture], config)
+        bad = np.zeros((events.height, events.width), np.bool_)
+        if config.hot_pixel_factor is not None:
+            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
+            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
+        clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
+    intensities = {capture: read_intensity_capture(files[capture], config) for capture in INTENSITY_CAPTURES}
+    return Target(folder.name, clean, hot, intensities, given_starts(folder))
+
 
 def find_captures(folder: Path) -> dict[str, Path]:
     """The eight captures of a target: events_0.*, ..., events_135.*, intensity_0.*, ..., intensity_135.*.
@@ -118,13 +153,12 @@ def given_starts(folder: Path) -> dict[str, int]:
 def read_event_capture(path: Path, config: RecordingsConfig) -> Events:
     """Events from the part of the sensor in use, by the capture's own clock."""
     height, width = config.sensor
-    reader = open_recording(path)
-    if reader.height < height or reader.width < width:
+    events = read_recording(path).events
+    if events.height < height or events.width < width:
         raise RecordingError(
-            f"{path.name}: recordings.sensor is {height}x{width}, the file's sensor {reader.height}x{reader.width}"
+            f"{path.name}: recordings.sensor is {height}x{width}, the file's sensor {events.height}x{events.width}"
         )
-    parts = [crop(chunk, 0, 0, height, width) for chunk in reader]
-    return concatenate(parts) if parts else Events.empty(height, width)
+    return crop(events, 0, 0, height, width)
 
 
 def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCapture:
@@ -134,6 +168,7 @@ def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCap
     where the pictures are fewer than two, without times, or smaller than the sensor.
     """
     (top, left), (height, width) = config.crop_corner, config.crop
+    landmark = np.s_[: config.region[0], config.sensor[1] - config.region[1] : config.sensor[1]]
     text = path / TIMES_FILE if path.is_dir() else path.with_suffix(".txt")
     stated = times_from_file(text, "us").tolist() if text.is_file() else None
     times, pictures, region = [], [], []
@@ -149,7 +184,7 @@ def read_intensity_capture(path: Path, config: RecordingsConfig) -> IntensityCap
             )
         times.append(picture.t_us)
         pictures.append(picture.intensity[top : top + height, left : left + width].copy())
-        region.append(float(region_of(picture.intensity, config).mean()) / STEPS_OF_8_BITS)
+        region.append(float(picture.intensity[landmark].mean()) / STEPS_OF_8_BITS)
     if len(pictures) < 2:
         raise RecordingError(f"{path.name}: expected at least two full pictures, got {len(pictures)}")
     if stated is not None and len(stated) != len(pictures):
@@ -171,22 +206,6 @@ def reduced(crop: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> Float3
     """The crop of a picture, averaged over areas to the final size, 0 to 255."""
     small = cv2.resize(crop.astype(np.float32), tuple(config.size[::-1]), interpolation=cv2.INTER_AREA)
     return small / np.float32(STEPS_OF_8_BITS)
-
-
-def over_time(
-    capture: IntensityCapture, start_us: float | int, config: RecordingsConfig, chosen: slice = slice(None)
-) -> Any:
-    """The reduced pictures as a function of the time since `start_us`: linear between two pictures, and beyond them."""
-    from scipy.interpolate import make_interp_spline  # half a second, which every stage would pay
-
-    pictures = np.stack([reduced(picture, config) for picture in capture.pictures[chosen]])
-    return make_interp_spline(capture.t_us[chosen] - start_us, pictures, k=1)
-
-
-def region_of(picture: UInt16[np.ndarray, "h w"], config: RecordingsConfig) -> UInt16[np.ndarray, "h2 w2"]:
-    """The landmark's region: the upper right corner of the part of the sensor in use."""
-    height, width = config.region
-    return picture[:height, config.sensor[1] - width : config.sensor[1]]
 
 
 def intensity_start_us(name: str, capture: IntensityCapture, config: RecordingsConfig) -> int:
@@ -222,13 +241,9 @@ def region_negative_times_us(events: Events, config: RecordingsConfig) -> Int64[
     return events.t[(events.p < 0) & (events.y < height) & (events.x >= events.width - width)]
 
 
-def landmark_starts(
-    events: Mapping[str, Events],
-    intensities: Mapping[str, IntensityCapture],
-    config: RecordingsConfig,
-    given: Mapping[str, int],
-) -> dict[str, int]:
-    """Start time of each capture by its own clock: `given` by hand, or when the landmark enters the region."""
+def landmark_starts(target: Target, config: RecordingsConfig) -> dict[str, int]:
+    """Start time of each capture by its own clock: given by hand, or when the landmark enters the region."""
+    events, intensities, given = target.events, target.intensities, target.given
     starts = {name: event_start_us(name, one, config) for name, one in events.items() if name not in given}
     starts |= {name: intensity_start_us(name, one, config) for name, one in intensities.items() if name not in given}
     starts |= given

@@ -19,18 +19,14 @@ from polarnet.captures.alignment import Alignment, refined_starts
 from polarnet.captures.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
-    IntensityCapture,
     RecordingsConfig,
+    Target,
     find_captures,
-    given_starts,
     landmark_starts,
-    over_time,
-    read_event_capture,
-    read_intensity_capture,
+    read_target,
     region_negative_times_us,
 )
 from polarnet.events.stream import Events, crop, downscale, shifted, slice_time
-from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.recordings.source import RecordingError
 from polarnet.storage.events import EventStore
 from polarnet.storage.frames import Contents, FrameStore
@@ -38,33 +34,6 @@ from polarnet.terminal.progress import ProgressBar
 
 STATUS_FILE = "status.json"
 WHITE = 255.0  # maximum of reduced pictures
-
-
-class Target(NamedTuple):
-    """The eight captures of one target, each by its own clock."""
-
-    name: str
-    events: Mapping[str, Events]
-    """Events without those of hot pixels."""
-    hot: Mapping[str, int]
-    """Number of hot pixels in each event capture."""
-    intensities: Mapping[str, IntensityCapture]
-    given: Mapping[str, int]
-    """Start times set by hand."""
-
-
-def read_target(folder: Path, config: RecordingsConfig) -> Target:
-    """The captures in a target's folder; RecordingError where a file is missing or damaged."""
-    files, clean, hot = find_captures(folder), {}, {}
-    for capture in EVENT_CAPTURES:
-        events = read_event_capture(files[capture], config)
-        bad = np.zeros((events.height, events.width), np.bool_)
-        if config.hot_pixel_factor is not None:
-            duration_s = float(events.t[-1] - events.t[0]) * 1e-6 if len(events) else 0.0
-            bad = hot_pixels(event_counts(events), duration_s, config.hot_pixel_factor)
-        clean[capture], hot[capture] = without_pixels(events, bad), int(bad.sum())
-    intensities = {capture: read_intensity_capture(files[capture], config) for capture in INTENSITY_CAPTURES}
-    return Target(folder.name, clean, hot, intensities, given_starts(folder))
 
 
 def start_over(out: Path, *, enabled: bool) -> None:
@@ -127,10 +96,8 @@ def calibrate_targets(
 def calibrate_target(target: Target, config: RecordingsConfig) -> Calibrated:
     """Start times of a target's captures; RecordingError where one is not found, or what they have in common short."""
     try:
-        starts = landmark_starts(target.events, target.intensities, config, target.given)
-        alignment = None
-        if config.alignment == "refined":
-            alignment = refined_starts(starts, target.events, target.intensities, config, target.given)
+        starts = landmark_starts(target, config)
+        alignment = refined_starts(target, starts, config) if config.alignment == "refined" else None
     except RecordingError as error:
         raise RecordingError(f"target {target.name}: {error}") from None
     used = starts if alignment is None else alignment.start_us
@@ -174,7 +141,7 @@ def aligned(
         channels.append(downscale(part, config.size[0], config.size[1]))
     planes = []
     for name in INTENSITY_CAPTURES:
-        frames = over_time(target.intensities[name], calibrated.start_us[name], config)(t_us)
+        frames = target.intensities[name].since(calibrated.start_us[name], config)(t_us)
         planes.append(torch.from_numpy(frames).float().div_(WHITE).clamp_(0, 1))
     return channels, torch.from_numpy(t_us), torch.stack(planes, dim=1)
 

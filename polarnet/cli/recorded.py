@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from polarnet.captures.alignment import MAX_PICTURES, Lag, best_lag, logarithms, steps
-from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, shifted, slice_time
+from polarnet.events.stream import Events, shifted, slice_time, split_mosaic
 from polarnet.events.streaming import TRAINED_WINDOW_US
 from polarnet.recordings.arrangements import Piece
 from polarnet.recordings.formats.celex5 import WHITE

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from polarnet import stokes
 from polarnet.clips.video import Piece
-from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, join_mosaic
 from polarnet.recordings.writers import FORMS
 from polarnet.reports.maps import encode_png
 from polarnet.reports.preview import write_true_video

@@ -1,6 +1,7 @@
 """Windows of events: those between the frames of a sequence, and those cut from a stream as it arrives."""
 
 import itertools
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -108,14 +109,10 @@ class WindowCutter:
     def _complete(self, until_us: int) -> Iterator[EventWindow]:
         while self._next_us <= until_us:
             start_us = self._next_us - self.rule.length_us
-            self._held = [slice_count(held, place, len(held)) for held, place in self._places(start_us)]
-            channels = [slice_count(held, 0, place) for held, place in self._places(self._next_us)]
+            self._held = [slice_time(held, start_us, sys.maxsize) for held in self._held]
+            channels = [slice_time(held, start_us, self._next_us) for held in self._held]
             yield EventWindow(channels, start_us, self._next_us)
             self._next_us += self.rule.step_us or self.rule.length_us
-
-    def _places(self, t_us: int) -> list[tuple[Events, int]]:
-        """The held events of each channel, and their number before a time."""
-        return [(held, int(torch.searchsorted(held.t, t_us))) for held in self._held]
 
 
 def windows_of(t_us: Int64[Tensor, " n"]) -> list[tuple[int, int]]:

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from pydantic import Field, PositiveFloat
 from torch import Tensor, nn
 
-from polarnet.events.mosaic import join_mosaic
 from polarnet.events.representations import REPRESENTATIONS, Encode, event_counts, voxel_grid
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, join_mosaic
 from polarnet.events.streaming import EventWindow
 from polarnet.methods.intensity_networks import load_baseline, voxel_grids
 from polarnet.methods.method import Method, Recoverer, Setup, each_map, network_recoverer, weights_file, windows_at_once

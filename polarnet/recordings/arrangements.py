@@ -8,14 +8,12 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events, shifted, slice_count
+from polarnet.events.stream import Events, shifted, slice_count, split_mosaic
 from polarnet.recordings.recording import RecordingReader, log_repairs, open_recording, whole
 from polarnet.recordings.source import Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
@@ -85,9 +83,9 @@ class FilePieces:
             yield Piece(nothing, piece.until_us + 1, time.perf_counter())
 
 
-def _files(readers: Sequence[RecordingReader], name: str, height: int, width: int, blocks: Blocks) -> Input:
+def _files(readers: Sequence[RecordingReader], height: int, width: int, blocks: Blocks) -> Input:
     repairs = [(reader.path.name, reader.repairs) for reader in readers]
-    return Input(name, height, width, FilePieces(blocks), repairs)
+    return Input(", ".join(name for name, _ in repairs), height, width, FilePieces(blocks), repairs)
 
 
 def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int | None = None) -> Iterator[Piece]:
@@ -110,8 +108,8 @@ def open_four(files: Mapping[int, str | os.PathLike[str]], open_file: Open = ope
     sizes = {(reader.height, reader.width) for reader in readers}
     if len(sizes) > 1:
         raise RecordingError(f"expected four files of one size of sensor, got {sorted(sizes)} (height, width)")
-    nothing, name = Events.empty(*sizes.pop()), ", ".join(Path(path).name for path in files.values())
-    return _files(readers, name, nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing))
+    nothing = Events.empty(*sizes.pop())
+    return _files(readers, nothing.height, nothing.width, lambda: _together(map(iter, readers), nothing))
 
 
 def _together(streams: Iterable[Iterator[Events]], nothing: Events) -> Iterator[list[Events]]:
@@ -145,8 +143,7 @@ def open_mosaic(path: str | os.PathLike[str], mosaic: Mosaic, open_file: Open = 
     """The channels of `read_mosaic`, in pieces."""
     reader = open_file(Path(path))
     one = split_mosaic(Events.empty(reader.height, reader.width), mosaic)[0]
-    blocks = partial(map, partial(split_mosaic, mosaic=mosaic), reader)
-    return _files([reader], reader.path.name, one.height, one.width, blocks)
+    return _files([reader], one.height, one.width, lambda: (split_mosaic(events, mosaic) for events in reader))
 
 
 def read_mosaic(path: str | os.PathLike[str], mosaic: Mosaic) -> list[Events]:
@@ -164,5 +161,5 @@ def read_mosaic(path: str | os.PathLike[str], mosaic: Mosaic) -> list[Events]:
 def open_plain(path: Path, open_file: Open = open_recording) -> Input:
     """One channel in pieces: all events of a camera without polarizers."""
     reader = open_file(path)
-    source = _files([reader], path.name, reader.height, reader.width, lambda: ([events] for events in reader))
+    source = _files([reader], reader.height, reader.width, lambda: ([events] for events in reader))
     return source._replace(channels=1)

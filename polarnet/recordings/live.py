@@ -24,8 +24,7 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
-from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import MAX_SIDE, Events
+from polarnet.events.stream import MAX_SIDE, Events, split_mosaic
 from polarnet.recordings.arrangements import Input, pieces_of
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import Clock, refuse_much_damage, usable

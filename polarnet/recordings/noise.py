@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int
 
-from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events, select
+from polarnet.events.stream import Events, places_of, select
 from polarnet.recordings.arrangements import Piece
 from polarnet.runtime.compilation import compiled
 from polarnet.stokes import Mosaic

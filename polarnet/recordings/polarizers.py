@@ -9,10 +9,10 @@ counts nor between pairings saw no polarization.
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from polarnet.events.stream import slice_time
-from polarnet.events.streaming import TRAINED_WINDOW_US, EventWindow, WindowCutter, WindowRule
+from polarnet.events.stream import Events, concatenate, slice_time
+from polarnet.events.streaming import TRAINED_WINDOW_US
 from polarnet.recordings.arrangements import Piece
 from polarnet.recordings.noise import event_counts, hot_pixels, without_pixels
 from polarnet.stokes import POLARIZER_ANGLES_DEG
@@ -41,28 +41,28 @@ class ChannelCheck:
         self.counts = [0, 0, 0, 0]
         """Number of events in each channel."""
         self._mosaic = mosaic
-        self._cutter = WindowCutter(WindowRule(TRAINED_WINDOW_US, None), height, width)
-        self._windows: list[EventWindow] = []
+        self._early: list[list[Events]] = [[Events.empty(height, width)] for _ in POLARIZER_ANGLES_DEG]
+        self._windows = 0  # of the first second, whose events have all arrived
 
     def watch(self, pieces: Iterable[Piece]) -> Iterator[Piece]:
         """Pass the pieces on unchanged, keeping the events of the first second."""
         for piece in pieces:
             self.counts = [n + len(events) for n, events in zip(self.counts, piece.channels, strict=True)]
-            if len(self._windows) < WINDOWS:
-                end_us = WINDOWS * TRAINED_WINDOW_US
-                early = [slice_time(events, 0, end_us) for events in piece.channels]
-                self._windows += self._cutter.add(early, min(piece.until_us, end_us))
+            if self._windows < WINDOWS:
+                for parts, events in zip(self._early, piece.channels, strict=True):
+                    parts.append(slice_time(events, 0, WINDOWS * TRAINED_WINDOW_US))
+                self._windows = min(piece.until_us // TRAINED_WINDOW_US, WINDOWS)
             yield piece
 
     def findings(self) -> list[str]:
         """Problems found, a sentence each; empty if there are none, or too few events to judge."""
-        seconds = len(self._windows) * TRAINED_WINDOW_US * 1e-6
-        counts = np.sum([[event_counts(e) for e in window.channels] for window in self._windows] or [[]], axis=0)
-        hot = [hot_pixels(count, seconds) for count in counts]
-        findings = _channel_findings(*pair_misfits(self._windows, hot), self.counts, self._mosaic)
-        if disturbing := sum(
-            int((bad & (n > DISTURBING_HZ * seconds)).sum()) for n, bad in zip(counts, hot, strict=True)
-        ):
+        stop_us = self._windows * TRAINED_WINDOW_US
+        seconds = stop_us * 1e-6
+        early = [slice_time(concatenate(parts), 0, stop_us) for parts in self._early]
+        counts = np.stack([*map(event_counts, early)])
+        hot = np.stack([hot_pixels(count, seconds) for count in counts])
+        findings = _channel_findings(*pair_misfits([*map(without_pixels, early, hot)]), self.counts, self._mosaic)
+        if disturbing := int((hot & (counts > DISTURBING_HZ * seconds)).sum()):
             findings.append(
                 f"Hot pixels with more than {DISTURBING_HZ:,.0f} events a second: {disturbing}. DoLP is wrong in the "
                 f"whole image; remove them with --hot-pixels found, or for a live camera with --hot-pixels FILE."
@@ -104,24 +104,21 @@ def _channel_findings(
     return []
 
 
-def pair_misfits(
-    windows: Sequence[EventWindow], hot: Sequence[Bool[np.ndarray, "h w"]]
-) -> tuple[Float64[np.ndarray, " 3"], int]:
-    """Root mean square difference between the sums of each of `PAIRS` of channels, without hot pixels.
+def pair_misfits(channels: Sequence[Events]) -> tuple[Float64[np.ndarray, " 3"], int]:
+    """Root mean square difference between the sums of each of `PAIRS` of channels in the first second.
 
     The sums are ON minus OFF events per block and window. The second value is the number of blocks with events. OFF
     events are weighted so that all ON and OFF events cancel, since the two thresholds may differ.
     """
-    cleaned = [[without_pixels(e, bad) for e, bad in zip(w.channels, hot, strict=True)] for w in windows]
-    on = sum(int((events.p > 0).sum()) for channels in cleaned for events in channels)
-    off = sum(len(events) for channels in cleaned for events in channels) - on
-    squares, lit = np.zeros(3), 0
-    for channels in cleaned:
-        columns = -(-channels[0].width // BLOCK)
-        blocks = -(-channels[0].height // BLOCK) * columns
-        place = [(e.y.long() // BLOCK * columns + e.x // BLOCK).numpy() for e in channels]
-        weights = [np.where(e.p.numpy() > 0, 1.0, -on / max(off, 1)) for e in channels]
-        sums = dict(zip(POLARIZER_ANGLES_DEG, map(np.bincount, place, weights, [blocks] * 4), strict=True))
-        lit += int(np.count_nonzero(np.bincount(np.concatenate(place), minlength=blocks)))
-        squares += [((sums[a] + sums[b] - sums[c] - sums[d]) ** 2).sum() for (a, b), (c, d) in PAIRS]
-    return np.sqrt(squares / max(lit, 1)), lit
+    on = sum(int((events.p > 0).sum()) for events in channels)
+    off = sum(map(len, channels)) - on
+    columns = -(-channels[0].width // BLOCK)
+    blocks = -(-channels[0].height // BLOCK) * columns
+    place = [
+        (e.t // TRAINED_WINDOW_US * blocks + e.y.long() // BLOCK * columns + e.x // BLOCK).numpy() for e in channels
+    ]
+    weights = [np.where(e.p.numpy() > 0, 1.0, -on / max(off, 1)) for e in channels]
+    sums = dict(zip(POLARIZER_ANGLES_DEG, map(np.bincount, place, weights, [WINDOWS * blocks] * 4), strict=True))
+    squares = [((sums[a] + sums[b] - sums[c] - sums[d]) ** 2).sum() for (a, b), (c, d) in PAIRS]
+    lit = int(np.count_nonzero(np.bincount(np.concatenate(place))))
+    return np.sqrt(np.array(squares) / max(lit, 1)), lit

@@ -12,23 +12,10 @@ import numpy as np
 import torch
 
 from polarnet.events.stream import Events
+from polarnet.recordings.content import GZIP, ZIP, start_of
 from polarnet.recordings.formats import aedat, celex5, faery, hdf5, lines, prophesee, rosbag
 from polarnet.recordings.repair import HARMLESS, repaired
-from polarnet.recordings.source import (
-    GZIP,
-    REPAIRS,
-    ZIP,
-    Block,
-    Blocks,
-    CameraFrames,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    joined,
-    sensor_size,
-    start_of,
-)
+from polarnet.recordings.source import REPAIRS, Blocks, CameraFrames, Choices, Counts, RecordingError, Source, cut
 
 CHUNK_EVENTS = 2**20
 
@@ -121,7 +108,7 @@ class RecordingReader:
         self.repairs.clear()
         self.repairs.share_read = 0.0
         sensor = self.height, self.width
-        for block in _cut(repaired(self.path.name, self._blocks, sensor, self.repairs, bridged_us), size):
+        for block in cut(repaired(self.path.name, self._blocks, sensor, self.repairs, bridged_us), size):
             t, x, y, p = map(torch.from_numpy, block)
             yield Events(t, x, y, p, self.height, self.width)
 
@@ -153,7 +140,7 @@ def open_recording(
     if form not in PACKABLE and path.is_file() and _packed(path):
         raise RecordingError(f"{path.name}: expected the format {form} outside an archive; unpack it")
     source = FORMATS[form].open(path, choices)
-    sensor = sensor_size(path, choices, source.height, source.width)
+    sensor = choices.sensor_of(path.name, source.height, source.width)
     return RecordingReader(path, form, source.blocks, sensor)
 
 
@@ -212,11 +199,10 @@ def is_recording(path: Path) -> bool:
 
 def detect_format(path: str | os.PathLike[str]) -> str:
     """Detect the format, a key of FORMATS, from a file's first bytes; RecordingError where none matches."""
-    path, head = Path(path), b""
-    if path.is_file():
-        head = start_of(path, lines.HEAD_BYTES)
-        if not head:
-            raise RecordingError(f"{path.name}: the file is empty")
+    path = Path(path)
+    head = start_of(path, lines.HEAD_BYTES) if path.is_file() else b""
+    if path.is_file() and not head:
+        raise RecordingError(f"{path.name}: the file is empty")
     for name, form in FORMATS.items():
         if (name == "rosbag" or head) and form.matches(path, head):  # a bag may be a folder
             return name
@@ -228,25 +214,3 @@ def detect_format(path: str | os.PathLike[str]) -> str:
 def _packed(path: Path) -> bool:
     with path.open("rb") as file:
         return file.read(len(ZIP)).startswith((GZIP, ZIP))
-
-
-def _cut(blocks: Iterator[Block], size: int) -> Iterator[Block]:
-    """The same events in blocks of `size`; the last block holds the remainder, also before a RecordingError."""
-    waiting: list[Block] = []
-    count, refusal = 0, None
-    try:
-        for block in blocks:
-            waiting.append(block)
-            count += len(block.t)
-            if count >= size:
-                whole = joined(waiting)
-                for start in range(0, count - size + 1, size):
-                    yield whole.rows(slice(start, start + size))
-                count %= size
-                waiting = [whole.rows(slice(len(whole.t) - count, None))]
-    except RecordingError as error:
-        refusal = error
-    if count:
-        yield joined(waiting)
-    if refusal is not None:
-        raise refusal

@@ -25,6 +25,7 @@ TOLERATED_SHARE = 0.01  # accepted share of a file's events, per kind of damage
 TOLERATED_COUNT = 8  # accepted count in files too short for a share
 HARMLESS = ("no_change", "unsorted", "pauses")
 MAX_TIME = 2**60  # microseconds; differences still fit into int64
+NONE = -(2**62)  # before the first credible time
 NEVER, UNKNOWN = -1, -2
 
 NOTHING = Block(np.empty(0, np.int64), *(np.empty(0, dtype) for dtype in (np.int16, np.int16, np.int8)))
@@ -93,10 +94,6 @@ def _typed(block: Block) -> Block:
     return Block(np.ascontiguousarray(block.t, np.int64), x, y, np.where(block.p == 1, np.int8(1), np.int8(-1)))
 
 
-def _joined(blocks: list[Block]) -> Block:
-    return joined([block for block in blocks if len(block.t)] or [NOTHING])
-
-
 class Clock:
     """Puts events in time order and leaves out those with wrong times: the one rule for files and live input.
 
@@ -112,7 +109,7 @@ class Clock:
         self._settled = False  # whether stale events of the camera's last run can no longer come
         self._judged = self._dropped = 0
         self._first: int | None = None
-        self._newest: int | None = None
+        self._newest = NONE
         self._floor = -MAX_TIME
         self._shift_us = 0
         self._unjudged = self._held = NOTHING
@@ -128,39 +125,36 @@ class Clock:
         `final` judges all times by the events at hand: at the end, and where live input makes a pause.
         """
         shifted = block._replace(t=block.t + self._shift_us) if self._shift_us else block
-        rest = _joined([self._unjudged, shifted])
-        accepted, reset = [self._held], True
-        while reset:
-            judged, reset, which = self._judge(rest, sum(len(one.t) for one in accepted), final)
-            accepted.append(rest.rows(which))
-            rest = rest.rows(slice(judged, None))
+        rest, held = joined([self._unjudged, shifted]), self._held
+        while True:
+            judged, reset, which = self._judge(rest, len(held.t), final)
+            held, rest = joined([held, rest.rows(which)]), rest.rows(slice(judged, None))
             if not reset:
                 break
-            ahead = rest.t[0] > (self._newest or 0)
+            ahead = rest.t[0] > self._newest
             if not self._settled and self._judged <= (FEW if ahead else MAX_STALE):
-                self.counts["stale"] += sum(len(one.t) for one in accepted)
-                accepted, self._newest = [NOTHING], None
+                self.counts["stale"] += len(held.t)
+                held, self._newest = NOTHING, NONE
             elif ahead and not self._live:
                 self.counts["pauses"] += 1
                 self._newest = int(rest.t[0])
-            elif self._live or self._elapsed_us(accepted) < self._bridged_us:
+            elif self._live or self._elapsed_us(held) < self._bridged_us:
                 rest = self._set_anew(rest)
             else:
                 self._settled = True
-                yield self._ready(_joined(accepted), final=True)
+                yield self._ready(held, final=True)
                 raise RecordingError(self._refusal(rest))
         self._unjudged = rest
         self._settled |= final or self._judged > MAX_STALE
-        yield self._ready(_joined(accepted), final)
+        yield self._ready(held, final)
 
     def _judge(self, block: Block, before: int, final: bool) -> tuple[int, bool, np.ndarray | slice]:
         """Number of judged events, whether the next one sets the clock anew, and which of them to keep."""
         keep = np.ones(len(block.t), np.bool_)
-        state = self._newest is not None, self._newest or 0, self._floor, self._dropped
         few = FEW if self._settled else min(FEW, before)
-        judged, reset, started, newest, self._dropped, counts = _judge(block.t, keep, *state, few, final)
+        state = self._newest, self._floor, self._dropped
+        judged, reset, self._newest, self._dropped, counts = _judge(block.t, keep, *state, few, final)
         self._judged += judged
-        self._newest = int(newest) if started else None
         self.counts.update(dict(zip(("time_glitches", "unsorted", "late", "pauses"), counts.tolist(), strict=True)))
         good = keep[:judged]
         return judged, reset, slice(judged) if good.all() else np.flatnonzero(good)
@@ -175,7 +169,7 @@ class Clock:
         elif self._live:
             self._floor = max(self._floor, int(accepted.t[-1])) if ready else self._floor
         elif not final:
-            ready = int(np.searchsorted(accepted.t, (self._newest or 0) - LATE_US))
+            ready = int(np.searchsorted(accepted.t, self._newest - LATE_US))
             if len(accepted.t) - ready > MAX_HELD:
                 ready = len(accepted.t) // 2
                 self._floor = int(accepted.t[ready - 1])
@@ -186,7 +180,6 @@ class Clock:
 
     def _set_anew(self, rest: Block) -> Block:
         """The events of live input from a clock's reset on, 10 ms after the newest event."""
-        assert self._newest is not None
         shift_us = self._newest + LATE_US - int(rest.t[0])
         if not self.counts["clock_resets"]:
             logger.warning(
@@ -199,14 +192,13 @@ class Clock:
         self._shift_us += shift_us
         return rest._replace(t=rest.t + shift_us)
 
-    def _elapsed_us(self, accepted: list[Block]) -> int:
+    def _elapsed_us(self, held: Block) -> int:
         """Time from the first event to the newest one."""
-        firsts = [int(one.t[0]) for one in accepted if len(one.t)] if self._first is None else [self._first]
-        return (self._newest or 0) - min(firsts, default=self._newest or 0)
+        return self._newest - (int(held.t.min(initial=self._newest)) if self._first is None else self._first)
 
     def _refusal(self, rest: Block) -> str:
-        before, after = ((one or 0) - self._shift_us for one in (self._newest, int(rest.t[0])))
-        elapsed_us, command = self._elapsed_us([]), f"polarnet convert {self.name} OUT"
+        before, after = self._newest - self._shift_us, int(rest.t[0]) - self._shift_us
+        elapsed_us, command = self._elapsed_us(NOTHING), f"polarnet convert {self.name} OUT"
         start = f" --start {self._bridged_us}us" if self._bridged_us else ""
         return (
             f"{self.name}: after event {self._judged}, time goes back by {before - after} us, from {before} to {after} "
@@ -217,12 +209,12 @@ class Clock:
 
 
 @compiled
-def _judge(t, keep, started, newest, floor, dropped, few, final):
+def _judge(t, keep, newest, floor, dropped, few, final):
     """Mark the events with credible times in `keep`, up to one that needs events not yet there.
 
-    Returns the number of judged events, whether the next one sets the clock anew, whether there was a credible time,
-    the newest one, the number of late events since the last credible one, and the counts of events far from the time of
-    others, out of order, too late, and after a pause.
+    Returns the number of judged events, whether the next one sets the clock anew, the newest credible time, the number
+    of late events since then, and the counts of events far from the time of others, out of order, too late, and after a
+    pause.
     """
     counts = np.zeros(4, np.int64)
     i = 0
@@ -231,8 +223,8 @@ def _judge(t, keep, started, newest, floor, dropped, few, final):
         if not -MAX_TIME < now < MAX_TIME:
             keep[i] = False
             counts[0] += 1
-        elif not started:
-            started, newest = True, now
+        elif newest == NONE:
+            newest = now
         elif newest - LATE_US <= now <= newest + LATE_US:
             keep[i] = now >= floor
             counts[1] += floor <= now < newest
@@ -249,7 +241,7 @@ def _judge(t, keep, started, newest, floor, dropped, few, final):
                 dropped += len(t) - i
                 back = len(t)
             if back == NEVER and other:
-                return i, True, started, newest, 0, counts
+                return i, True, newest, 0, counts
             if back == NEVER:
                 counts[3] += now - newest > PAUSE_US
                 newest = now
@@ -259,7 +251,7 @@ def _judge(t, keep, started, newest, floor, dropped, few, final):
                 counts[0] += back - i
                 i = back - 1
         i += 1
-    return i, False, started, newest, dropped, counts
+    return i, False, newest, dropped, counts
 
 
 @compiled

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
-from polarnet.events.mosaic import places_of
+from polarnet.events.stream import places_of
 from polarnet.pictures.polarimetry import levels_at_angles, white_level
 from polarnet.recordings.recording import FORMATS, detect_format
 from polarnet.recordings.source import CameraFrames, RecordingError

@@ -16,8 +16,7 @@ from jaxtyping import Float32, Float64, Int64
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
-from polarnet.events.mosaic import places_of
-from polarnet.events.stream import Events, select
+from polarnet.events.stream import Events, places_of, select
 from polarnet.runtime.compilation import compiled, forget_stale_code
 from polarnet.runtime.machine import seed_for
 from polarnet.runtime.sections import one_of, section

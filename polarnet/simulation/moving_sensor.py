@@ -11,8 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from polarnet.events.mosaic import join_mosaic, split_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, join_mosaic, split_mosaic
 from polarnet.simulation.camera import (
     Camera,
     PolarizersConfig,

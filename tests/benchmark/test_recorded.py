@@ -10,8 +10,7 @@ import zarr
 from polarnet.cli import main
 from polarnet.cli.recorded import clock_notes, frame_lag, make_recorded_set, read_recorded
 from polarnet.config.tree import load
-from polarnet.events.mosaic import join_mosaic
-from polarnet.events.stream import Events, merge, shifted
+from polarnet.events.stream import Events, join_mosaic, merge, shifted
 from polarnet.networks.e2p.network import MOSAIC
 from polarnet.pictures.dead_leaves import dead_leaves
 from polarnet.pictures.images import write_png

@@ -11,6 +11,7 @@ from polarnet.captures.dot import (
     EVENT_CAPTURES,
     INTENSITY_CAPTURES,
     IntensityCapture,
+    Target,
     event_start_us,
     find_captures,
     given_starts,
@@ -103,7 +104,7 @@ def test_captures_start_with_the_first_dark_picture_and_the_45th_negative_event(
 
 def test_starts_given_by_hand_take_the_place_of_the_rule(config, make_events):
     events, intensities = {"events_0": make_events([], HEIGHT, WIDTH)}, {"intensity_0": pictures([100.0, 1.0])}
-    starts = landmark_starts(events, intensities, config, {"events_0": 123})
+    starts = landmark_starts(Target("a", events, {}, intensities, {"events_0": 123}), config)
     assert starts == {"events_0": 123, "intensity_0": 10_000}
 
 

@@ -14,8 +14,7 @@ from filelock import FileLock
 
 from polarnet.cli import main, simulated_files
 from polarnet.clips import simulate_video, video
-from polarnet.events.mosaic import split_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, split_mosaic
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import fit, read_rgb
 from polarnet.pictures.polarimetry import demosaic

@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from polarnet.events.mosaic import join_mosaic, split_mosaic
-from polarnet.events.stream import Events, concatenate, crop, downscale, merge, slice_time, validate
+from polarnet.events.stream import (
+    Events,
+    concatenate,
+    crop,
+    downscale,
+    join_mosaic,
+    merge,
+    slice_time,
+    split_mosaic,
+    validate,
+)
 from polarnet.stokes import POLARIZER_ANGLES_DEG, parse_mosaic
 
 

@@ -6,8 +6,7 @@ import itertools
 import pytest
 import torch
 
-from polarnet.events.mosaic import join_mosaic, split_mosaic
-from polarnet.events.stream import Events
+from polarnet.events.stream import Events, join_mosaic, split_mosaic
 from polarnet.recordings.arrangements import Piece, read_mosaic
 from polarnet.recordings.polarizers import ChannelCheck
 from polarnet.simulation import BUILTIN_PHOTOS, MOTIONS, SENSORS, read_rgb, scene_from_polarization, simulate

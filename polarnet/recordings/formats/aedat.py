@@ -22,21 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    CameraFrames,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    chosen_part,
-    header_lines,
-    sensor_size,
-    unpacked,
-    unwrapped,
-    word_blocks,
-)
+from polarnet.recordings.content import header_lines, unpacked, unwrapped, word_blocks
+from polarnet.recordings.source import BLOCK_EVENTS, Block, CameraFrames, Choices, Counts, RecordingError, Source
 
 MAGIC_2, MAGIC_3 = b"#!AER-DAT2", b"#!AER-DAT3"
 LAST_LINE_2 = b"#End Of ASCII Header"  # only in newer files; an event can begin with # too
@@ -108,7 +95,7 @@ def _described(path: Path, choices: Choices) -> tuple[int, int, int]:
     chip = re.search(rb"# AEChip: [\w.]*?(346|240|128)", header)
     if chip and chip[1] == DVS128:
         raise RecordingError(f"{path.name}: expected the recording of a DAVIS, got one of a DVS128")
-    return len(header), *sensor_size(path, choices, *(SENSORS[chip[1]] if chip else (None, None)))
+    return len(header), *choices.sensor_of(path.name, *(SENSORS[chip[1]] if chip else (None, None)))
 
 
 def open_aedat3(path: Path, choices: Choices) -> Source:
@@ -121,7 +108,7 @@ def open_aedat3(path: Path, choices: Choices) -> Source:
             f"{path.name}: expected AEDAT 3.1 of format RAW, got {form[1].decode()}; convert it with DV"
         )
     names = {number.decode(): name for number, name in re.findall(rb"#Source (\d+): *(\S+)", header)}
-    source = chosen_part(path, choices.part, list(names), "source of events")
+    source = choices.part_of(path.name, list(names), "source of events")
     camera = re.search(rb"\d{3}", names[source])
     height, width = SENSORS.get(camera[0], (None, None)) if camera else (None, None)
 

@@ -11,6 +11,7 @@ and its two lowest bits give its kind. Time stamps of 16 bits wrap around.
 A line of CSV is row, column, intensity (0 to 4095), polarity (-1, 0 or 1), t in Event Intensity mode.
 """
 
+import operator
 import struct
 from collections import namedtuple
 from collections.abc import Iterator
@@ -20,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64, UInt8, UInt16
 
+from polarnet.recordings.content import start_of, unpacked
 from polarnet.recordings.formats.lines import HEAD_BYTES, number_blocks, numbers_of
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, start_of, unpacked
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 HEIGHT, WIDTH = 800, 1280
@@ -38,7 +40,8 @@ LOOP, IMU = 1, 2  # bits of the data type
 
 MODES = ("Event Off-Pixel Timestamp", "Event In-Pixel Timestamp", "Event Intensity", "Full Picture",
          "Optical Flow", "Optical Flow FPN", "Multi-Read Optical Flow")  # fmt: skip
-INTENSITY, FULL_PICTURE = 2, 3  # of `MODES`
+INTENSITY, FULL_PICTURE, NO_MODE = 2, 3, b"\xff"  # of `MODES`
+MAX_HEADER = bytes([LOOP | IMU, *[len(MODES)] * 3, 2, 23, 59, 59])  # largest values of a header's first 8 bytes
 
 PICTURE_BYTES = HEIGHT * WIDTH * 3 // 2 + 1
 MAX_PACKAGE = 2_048_000  # bytes; the limit of the vendor's library
@@ -160,24 +163,16 @@ def _unpacked(data: np.ndarray) -> np.ndarray:
 
 def _header(head: bytes) -> Header | None:
     """The header of a BIN file; None if the bytes are too few or not plausible."""
-    if len(head) < HEADER.size:
+    modes = head[1:4].replace(NO_MODE, b"\0")
+    if len(head) < HEADER.size or any(map(operator.gt, head[:1] + modes + head[4:8], MAX_HEADER)):
         return None
-    header = Header(*HEADER.unpack_from(head))
-    modes = header.loop_a, header.loop_b, header.loop_c
-    plausible = (
-        header.data_type <= LOOP | IMU
-        and header.event_format <= 2
-        and (header.hour < 24 and header.minute < 60 and header.second < 60)
-        and all(mode <= len(MODES) or mode == 255 for mode in modes)
-    )
-    return header if plausible else None
+    return Header(*HEADER.unpack_from(head))
 
 
 def _opened(path: Path) -> Header:
-    header = _header(start_of(path, HEADER.size))
-    if header is None:
-        raise RecordingError(f"{path.name}: expected the {HEADER.size} bytes of a BIN header of a CeleX-5 at its start")
-    return header
+    if header := _header(start_of(path, HEADER.size)):
+        return header
+    raise RecordingError(f"{path.name}: expected the {HEADER.size} bytes of a BIN header of a CeleX-5 at its start")
 
 
 def _packages(path: Path, counts: Counts) -> Iterator[tuple[int | None, UInt8[np.ndarray, " bytes"]]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import Block, CameraFrames, Choices, Counts, RecordingError, Source, chosen_part
+from polarnet.recordings.source import Block, CameraFrames, Choices, Counts, RecordingError, Source
 
 FAERY = Library("faery", "faery", "the file is damaged")
 
@@ -19,7 +19,7 @@ def open_faery(path: Path, choices: Choices, *, aedat4: bool) -> Source:
     A file of AEDAT4 that ends within a packet is read up to there.
     """
     streams = ask_once(FAERY, path, isolated_worker.faery_streams, aedat4)
-    stream = chosen_part(path, choices.part, list(streams), "stream of events")
+    stream = choices.part_of(path.name, list(streams), "stream of events")
 
     def blocks(counts: Counts) -> Iterator[Block]:
         for columns in ask(FAERY, path, isolated_worker.faery_events, stream):

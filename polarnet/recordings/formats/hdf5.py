@@ -9,16 +9,7 @@ import numpy as np
 
 from polarnet.recordings.formats import isolated_worker
 from polarnet.recordings.formats.isolated import Library, ask, ask_once
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    CameraFrames,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    chosen_part,
-)
+from polarnet.recordings.source import BLOCK_EVENTS, Block, CameraFrames, Choices, Counts, RecordingError, Source
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 TRIGGERS = "triggers"  # times of a trigger signal in microseconds
@@ -93,7 +84,7 @@ def open_hdf5(layout: Layout, path: Path, choices: Choices) -> Source:
     if not parts:
         absent = ", ".join(table for table in dict(layout.of(layout.parts[0])) if table not in tables)
         raise RecordingError(f"{path.name}: expected HDF5 of {layout.owner}: there is no {absent}")
-    part = parts[0] if parts == [""] else chosen_part(path, choices.part, parts, "camera")
+    part = parts[0] if parts == [""] else choices.part_of(path.name, parts, "camera")
     columns = layout.of(part)
     lengths = [_length(path, tables, *column) for column in columns]
     if len(set(lengths)) > 1:

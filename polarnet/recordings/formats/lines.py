@@ -13,17 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    byte_blocks,
-    start_of,
-    unpacked,
-)
+from polarnet.recordings.content import byte_blocks, start_of, unpacked
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 HEAD_BYTES = 4096  # bytes at the start of a file; enough for every format to recognise its own
@@ -56,21 +47,9 @@ _KINDS = np.zeros(256, np.uint8)  # of a byte: 0 for a part of a number
 _KINDS[list(b" ,;\t\r\n")], _KINDS[list(b"#%")] = _SEPARATOR_CODE, _COMMENT_CODE
 
 
-class _Layout(NamedTuple):
-    """Facts about a file of lines from its head."""
-
-    order: tuple[str, ...] | None
-    """Names of the columns; None if these are no lines of events."""
-    start: int
-    """Byte offset of the first line that can be an event."""
-    size: Sequence[str]
-    """Width and height, if stated."""
-    columns: int
-
-
 def matches_text(path: Path, head: bytes) -> bool:
     """Whether the first lines name the columns or say `width height`, or are four numbers with a polarity."""
-    return _layout_of(head).order is not None
+    return _layout_of(head)[0] is not None
 
 
 def open_text(path: Path, choices: Choices) -> Source:
@@ -102,7 +81,8 @@ def open_text(path: Path, choices: Choices) -> Source:
     return Source(height, width, blocks)
 
 
-def _layout_of(head: bytes) -> _Layout:
+def _layout_of(head: bytes) -> tuple[tuple[str, ...] | None, int, Sequence[str], int]:
+    """Names of the columns (None: no lines of events), offset of the first event, width and height, column count."""
     geometry = _GEOMETRY.search(head)
     size: Sequence[str] = [side.decode() for side in geometry.groups()] if geometry else []
     order, start = _names(head)
@@ -114,7 +94,7 @@ def _layout_of(head: bytes) -> _Layout:
         order = _order_of([line.words for line in lines])
     if order is None and (size or not head.strip()):
         order = COLUMNS
-    return _Layout(order, start, size, len(lines[0].words) if lines else len(COLUMNS))
+    return order, start, size, len(lines[0].words) if lines else len(COLUMNS)
 
 
 def _names(head: bytes) -> tuple[tuple[str, ...] | None, int]:

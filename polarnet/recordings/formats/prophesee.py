@@ -15,30 +15,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from polarnet.recordings.source import (
-    BLOCK_EVENTS,
-    Block,
-    Choices,
-    Counts,
-    RecordingError,
-    Source,
-    header_lines,
-    unwrapped,
-    word_blocks,
-)
+from polarnet.recordings.content import header_lines, unwrapped, word_blocks
+from polarnet.recordings.source import BLOCK_EVENTS, Block, Choices, Counts, RecordingError, Source
 from polarnet.runtime.compilation import compiled
 
 PREFIX, LAST_LINE = b"% ", b"% end"
 MAX_HEADER_BYTES = 2**16
 EVT_BLOCK_WORDS = 2**17
-SENSORS = {(480, 640): (b"gen3", b"3"), (720, 1280): (b"gen4|imx6", b"4"), (320, 320): (b"genx320", b"none")}
-"""Sensors' names and generation by height and width, in headers of EVT; files of 2020 state nothing else."""
-SYSTEMS = {
-    (480, 640): (21, 23, 25, 28, 29, 33, 34, 35, 40, 41),
-    (720, 1280): (26, 30, 31, 32, 39, 46, 48, 49, 50, 52, 53, 54, 58, 66),
-    (320, 320): (59, 64),
+SENSORS = {
+    (480, 640): (b"gen3", b"3", (21, 23, 25, 28, 29, 33, 34, 35, 40, 41)),
+    (720, 1280): (b"gen4|imx6", b"4", (26, 30, 31, 32, 39, 46, 48, 49, 50, 52, 53, 54, 58, 66)),
+    (320, 320): (b"genx320", b"none", (59, 64)),
 }
-"""System IDs of cameras by height and width, as in OpenEB."""
+"""Sensors' names, generation and cameras' system IDs (as in OpenEB) by height and width, in headers of EVT."""
 FIRST_LITTLE_ENDIAN = 55  # system ID of the EVK2 that came after those with exchanged halves
 DAT_EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 CHANGE_DETECTION = (0, 12)  # DAT's types of events: 2D of the first sensors, CD of the later ones
@@ -127,12 +116,11 @@ def _evt_size(header: bytes) -> tuple[int | None, int | None]:
     height, width = (re.search(name + rb"=(\d{1,5})", header) for name in (b"height", b"width"))
     if height and width:
         return int(height[1]), int(width[1])
-    for size, (names, generation) in SENSORS.items():
+    for size, (names, generation, systems) in SENSORS.items():
         named = rb"(?:plugin|sensor)_name [^\n]*(?:" + names + rb")|sensor_generation " + generation
-        if re.search(rb"(?i)% (?:" + named + rb")", header):
+        if re.search(rb"(?i)% (?:" + named + rb")", header) or _system_id(header) in systems:
             return size
-    system = _system_id(header)
-    return next((size for size, systems in SYSTEMS.items() if system in systems), (None, None))
+    return None, None
 
 
 def _is_legacy(header: bytes) -> bool:

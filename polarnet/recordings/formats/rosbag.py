@@ -8,7 +8,6 @@ Metavision and libcaer write them.
 import contextlib
 import struct
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from polarnet.recordings.formats.isolated_worker import gathered
 from polarnet.recordings.formats.prophesee import EVT_START, evt_block
-from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source, chosen_part
+from polarnet.recordings.source import Block, Choices, Counts, RecordingError, Source
 from polarnet.terminal.installation import installation
 
 SUFFIXES = {b"#ROSBAG V": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3": ".db3"}
@@ -51,7 +50,7 @@ def open_rosbag(path: Path, choices: Choices) -> Source:
                 f"{path.name}: expected a topic of EventArray (dvs_msgs or prophesee_event_msgs) or EventPacket "
                 f"(event_camera_msgs), got only {others[:300]}"
             )
-        topic = chosen_part(path, choices.part, topics, "topic of events")
+        topic = choices.part_of(path.name, topics, "topic of events")
         first = next(_messages(bag, topic, Counts()), None)
     height, width = (None, None) if first is None else first[:2]
 
@@ -80,12 +79,9 @@ def _opened(path: Path) -> Iterator[Any]:
         store.register(get_types_from_msg(text, name))
     try:
         with AnyReader([path], default_typestore=store) as bag:
-            if strange := [
-                name
-                for name in DEFINITIONS
-                if bag.typestore.fielddefs.get(name, store.fielddefs[name]) != store.fielddefs[name]
-            ]:
-                raise RecordingError(f"{path.name}: expected {strange[0]} with the fields {DEFINITIONS[strange[0]]!r}")
+            for name, text in DEFINITIONS.items():
+                if bag.typestore.fielddefs.get(name, store.fielddefs[name]) != store.fielddefs[name]:
+                    raise RecordingError(f"{path.name}: expected {name} with the fields {text!r}")
             yield bag
     except RecordingError:
         raise
@@ -147,11 +143,6 @@ def _packet_blocks(path: Path, packets: Iterator[Any], counts: Counts) -> Iterat
         yield decode(words.astype(word, copy=False), packet.time_base, state, counts)
 
 
-def _evt(version: str, words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
-    """Prophesee's words, whose time runs on from packet to packet."""
-    return evt_block(version, words, state, counts)
-
-
 def _mono(words: np.ndarray, base: int, state: np.ndarray, counts: Counts) -> Block:
     """Words of 64 bits: nanoseconds since the packet's time base, x, y, polarity."""
     t = (base + (words & np.uint64(0xFFFFFFFF)).astype(np.int64)) // 1000
@@ -172,8 +163,8 @@ def _libcaer_compressed(words: np.ndarray, base: int, state: np.ndarray, counts:
 
 
 PACKETS: dict[str, tuple[str, Callable[[np.ndarray, int, np.ndarray, Counts], Block]]] = {
-    "evt3": ("u2", partial(_evt, "3")),
-    "evt2": ("u4", partial(_evt, "2")),
+    "evt3": ("u2", lambda words, base, *passed_on: evt_block("3", words, *passed_on)),
+    "evt2": ("u4", lambda words, base, *passed_on: evt_block("2", words, *passed_on)),
     "mono": ("u8", _mono),
     "libcaer": ("u4", _libcaer),
     "libcaer_cmp": ("u2", _libcaer_compressed),
