@@ -13,8 +13,7 @@ from ruamel.yaml import YAML
 from polarnet.methods import is_rotating
 from polarnet.pictures.manifest import Manifest, read_manifest
 from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, results_table
-from polarnet.reports.charts import error_chart, reliability_chart
-from polarnet.reports.figures import comparison_figure, svg
+from polarnet.reports.figures import comparison_figure, error_chart, reliability_chart, svg
 from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
 from polarnet.reports.maps import write_figure
 from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
