@@ -10,7 +10,7 @@ from polarnet.config.benchmark_tables import collect_rows, copy_histories
 from polarnet.config.experiments import changed_values
 from polarnet.config.pipeline import set_folder
 from polarnet.config.tree import Config, hydra_stage
-from polarnet.reports.artefacts import ReportPaths, Run, facts, git, read_results, results_table
+from polarnet.reports.artefacts import ReportPaths, Run, facts, git, read_results
 from polarnet.reports.page import write_report
 from polarnet.reports.tables import as_plain
 
@@ -36,7 +36,7 @@ def main(config: Config) -> None:
     tables = collect_rows(config)
     copy_histories(config)
     for name in tables:
-        print(f"\ntest set {name}\n" + as_plain(results_table(read_results(set_folder(config, name)))))
+        print(f"\ntest set {name}\n" + as_plain(read_results(set_folder(config, name)).table))
     paths = ReportPaths(**{f.name: Path(getattr(config.paths, f.name)) for f in dataclasses.fields(ReportPaths)})
     parameters = {
         name: value if isinstance(value, int | str) else dataclasses.asdict(value)

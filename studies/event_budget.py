@@ -25,7 +25,7 @@ from polarnet.events.stream import Events, slice_count, slice_time
 from polarnet.events.streaming import EventWindow
 from polarnet.methods import METHODS
 from polarnet.methods.method import Recoverer
-from polarnet.reports.figures import LIGHT, show_picture, styled, tile_grid
+from polarnet.reports.figures import show_picture, styled, tile_grid
 from polarnet.reports.maps import dolp_image, event_full_scale, event_image, write_figure
 from studies.study import ROOT
 
@@ -66,7 +66,7 @@ def recovered_alone(windows: Sequence[EventWindow], recoverer: Recoverer) -> Flo
     return torch.cat([recoverer.step(start, [window])[1].dolp.cpu() for window in windows])
 
 
-@styled(LIGHT)
+@styled
 def figure_11(sequence: TestSequence, windows: Sequence[EventWindow], recovered: Float[Tensor, "n h w"]) -> Figure:
     """Event tensors at 0 degrees, the DoLP recovered from them and the closest true DoLP, a column for each window."""
     figure, grid = tile_grid(3, len(windows), sequence.dolp.shape[1:], bar_row=1)
@@ -75,7 +75,7 @@ def figure_11(sequence: TestSequence, windows: Sequence[EventWindow], recovered:
         truth = sequence.dolp[int((sequence.t_us[1:] - window.stop_us).abs().argmin())]
         pictures = event_image(tensor, event_full_scale(tensor)), dolp_image(dolp), dolp_image(truth)
         for axes, picture in zip(column, pictures, strict=True):
-            show_picture(axes, picture, LIGHT)
+            show_picture(axes, picture)
         count = round(sum(map(len, window.channels)) / len(window.channels))
         column[0].set_title(f"t = {window.stop_us / 1000:.1f} ms, n = {count:,}", fontsize=6.5, pad=3)
     for axes, name in zip(grid[:, 0], ("event tensor", "recovered", "truth"), strict=True):

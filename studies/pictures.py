@@ -28,7 +28,7 @@ from polarnet.methods.intensities import consistent
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
 from polarnet.pictures.images import read_rgb
 from polarnet.recovery import recover
-from polarnet.reports.figures import LIGHT, show_picture, styled
+from polarnet.reports.figures import FACE, GREY, GRID, TEXT, show_picture, styled
 from polarnet.reports.maps import dolp_image, intensity_image, png, polarization_hsv
 from polarnet.simulation.emulator import EmulatorConfig, emulate
 from polarnet.simulation.motion import Trajectory, sensor_to_scene
@@ -42,7 +42,7 @@ from studies.study import PICTURES, ROOT
 
 ON, OFF = "#d0312d", "#1f5fb8"
 LINES = ("#1c2330", "#2f7fc1", "#3f9c6d", "#e08a1e")
-LINE: dict[str, Any] = {"color": LIGHT.quiet, "linewidth": 1.3}
+LINE: dict[str, Any] = {"color": GREY, "linewidth": 1.3}
 PALETTE = 128  # number of colours of a picture on disk
 QUIET = replace(SENSORS["clean"], contrast_threshold_sigma_on=0.0, contrast_threshold_sigma_off=0.0)
 
@@ -60,10 +60,10 @@ VARIATIONS = {
 """Parameters of the pixel, and their values and unit in a picture."""
 
 
-@styled(LIGHT)
+@styled
 def drawn(draw: Callable[[Figure], None], width: float, height: float) -> Figure:
     """A figure in the style of docs; sizes in inches."""
-    figure = Figure(figsize=(width, height), layout="constrained", facecolor=LIGHT.face)
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor=FACE)
     draw(figure)
     return figure
 
@@ -123,11 +123,11 @@ def crossings_figure(figure: Figure) -> None:
     log = np.interp(t_ms, frames_ms, np.log(light_of_one_pixel(frames_ms)))
     curve, stamps = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     curve.plot(t_ms, log, **LINE)
-    curve.plot(frames_ms, np.log(light_of_one_pixel(frames_ms)), "o", color=LIGHT.text, markersize=3)
+    curve.plot(frames_ms, np.log(light_of_one_pixel(frames_ms)), "o", color=TEXT, markersize=3)
     events = slice_time(pixel_events(QUIET, rate_hz), 0, int(1000 * t_ms[-1]))
     for t, p in zip(events.t.numpy() / 1000, events.p.numpy(), strict=True):
         level = float(np.interp(t, t_ms, log))
-        curve.plot([0, t], [level, level], color=LIGHT.grid, linewidth=0.8, zorder=0)
+        curve.plot([0, t], [level, level], color=GRID, linewidth=0.8, zorder=0)
         curve.plot([t], [level], "^" if p > 0 else "v", color=ON if p > 0 else OFF, markersize=6)
     curve.set_ylabel("ln light")
     curve.set_title(f"a step of {threshold:g} in log light is an event; dots: frames at 60 Hz", loc="left", fontsize=9)
@@ -163,8 +163,8 @@ DARKEST = 0.004  # of white; added behind every polarizer, as stray light
 SIZE = (200, 300)  # rows and columns of the sensor behind the presets
 EVENT_STYLES: tuple[dict[str, Any], ...] = (
     {"color": LINES[0]}, {"color": LINES[2]}, {"color": LINES[3]}, {"color": ON},
-    {"color": LINES[1], "linestyle": "--"}, {"color": LIGHT.quiet, "linestyle": ":"},
-    {"color": LIGHT.quiet, "linestyle": "-."},
+    {"color": LINES[1], "linestyle": "--"}, {"color": GREY, "linestyle": ":"},
+    {"color": GREY, "linestyle": "-."},
 )  # fmt: skip
 V2E_NOISE = (0.0551, 0.211)  # deviation, and events of each sign per second in two runs (tests of the emulator's noise)
 
@@ -181,7 +181,7 @@ def gains_figure(figure: Figure) -> None:
     unknown, factors = (dolp(stokes_from_intensities(one)) for one in (wrong, solved))
     panels = {"true": dolp(truth), "factors unknown": unknown, "factors solved": factors}
     for axes, (name, degree) in zip(figure.subplots(1, 3), panels.items(), strict=True):
-        show_picture(axes, dolp_image(degree), LIGHT)
+        show_picture(axes, dolp_image(degree))
         rms = float((degree.clamp(0, 1) - panels["true"]).square().mean().sqrt())
         axes.set_title("true DoLP" if name == "true" else f"{name}: RMS error {rms:.3f}", fontsize=9)
 
@@ -268,7 +268,7 @@ def overview_figure(figure: Figure) -> None:
         part.set_facecolor("none")
         part.suptitle(heading, color=LABEL, fontsize=13, weight="bold")
     axes = columns[0].subplots()
-    show_picture(axes, picture.permute(1, 2, 0).numpy(), LIGHT)
+    show_picture(axes, picture.permute(1, 2, 0).numpy())
     axes.plot(*sensor_outline(simulation.trajectory, stop_us / 1e6, *dolp.shape), color="white", linewidth=1.5)
     axes.set_xlabel(KEY, color=LABEL, fontsize=11, linespacing=1.6)
     _pictures(columns[1], DoLP=dolp_image(dolp), AoLP=polarization_hsv(full, full, aolp), S0=intensity_image(s0))
@@ -291,7 +291,7 @@ def _pictures(figure: Figure, **pictures: np.ndarray) -> None:
     """One picture below the other, each with its label."""
     box = {"facecolor": "black", "alpha": 0.55, "edgecolor": "none", "pad": 1.6}
     for axes, (label, picture) in zip(figure.subplots(len(pictures), 1), pictures.items(), strict=True):
-        show_picture(axes, picture, LIGHT)
+        show_picture(axes, picture)
         axes.text(0.02, 0.97, label, transform=axes.transAxes, va="top", color="white", fontsize=10, bbox=box)
 
 

@@ -14,26 +14,24 @@ from typing import Any
 from polarnet.benchmark.results import write_benchmark
 from polarnet.benchmark.rows import available, weights_used
 from polarnet.benchmark.run import run_benchmark
-from polarnet.benchmark.sequences import train_mean_dolp
 from polarnet.cli.options import CLEANING, cleaning_of, refuse
 from polarnet.cli.outputs import WORK, run_folder
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.cli.recorded import make_recorded_set
-from polarnet.config.pipeline import context_of, lpips_of, made_set
+from polarnet.config.pipeline import context_of, lpips_of, made_set, train_mean_of
 from polarnet.config.tree import Config, load
 from polarnet.methods import is_rotating
 from polarnet.metrics.lpips import record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
 from polarnet.recordings.noise import Cleaning
-from polarnet.reports.artefacts import read_results, results_table
+from polarnet.reports.artefacts import read_results
 from polarnet.reports.page import write_set_page
 from polarnet.reports.tables import as_plain
 from polarnet.runtime.machine import configure, on_one_thread, usable_cores
 from polarnet.simulation.sets import emulate_scenes, make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.stokes import parse_mosaic
-from polarnet.storage.frames import FrameStore
 from polarnet.storage.scenes import SceneStore
 
 PDAVIS = "90 45 / 135 0"
@@ -57,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
         config = load(settings_root(), [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         notes = _score_folder(options, config, root, cleaning)
-    print(as_plain(results_table(read_results(options.out))), *notes, sep="\n")
+    print(as_plain(read_results(options.out).table), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")
 
 
@@ -71,8 +69,7 @@ def _score_folder(options: argparse.Namespace, config: Config, root: Path, clean
         lpips = None
         without_lpips.append(f"LPIPS was left out: {error}.")
     wanted = list(dict.fromkeys([*config.benchmark.methods, *(["ours"] if options.weights else [])]))
-    frames = Path(config.paths.frames)  # None: the pipeline has not made a training split
-    mean = train_mean_dolp(FrameStore.open(frames), config.benchmark.warmup_windows) if frames.exists() else None
+    mean = train_mean_of(config) if Path(config.paths.frames).exists() else None  # None: no training split was made
     context = context_of(config, wanted, mean, options.weights or shipped_weights())
     methods, left_out = available(wanted, context)
     if options.recordings:

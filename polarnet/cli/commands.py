@@ -39,13 +39,9 @@ class Command(argparse.ArgumentParser):
                 raise FileNotFoundError(f"{name}: there is no such file or folder")
 
 
-AddCommand: TypeAlias = Callable[..., Command]
-"""`_command` without its first argument."""
-AddArgument: TypeAlias = Callable[..., object]
-"""`add_argument` of a command."""
+AddCommand: TypeAlias = Callable[..., Command]  # `_command` without its first argument
+AddArgument: TypeAlias = Callable[..., object]  # `add_argument` of a command
 
-BESIDE = ""
-"""Value of --truth without a path."""
 _wrapped = functools.partial(textwrap.fill, width=100, subsequent_indent="  ")
 
 
@@ -118,10 +114,7 @@ def _project(command: AddCommand) -> None:
     _overrides(add)
     command("doctor", "doctor.doctor", "report versions, device, weights, extras, memory and disk", "doctor")
     add = command(
-        "preset",
-        "project.preset",
-        "write a named experiment or sensor into params.yaml",
-        "preset smoke",
+        "preset", "project.preset", "write a named experiment or sensor into params.yaml", "preset smoke"
     ).add_argument
     add("name", help="name of a file in conf/experiment or conf/sensor: demo, smoke, paper, noisy, ...")
     add = command(
@@ -206,20 +199,13 @@ Words KEY=VALUE replace values of params.yaml or choose presets of conf/: sensor
     add("--out", type=Path, metavar="FOLDER", help="output folder (default: outputs/simulate/NAME)")
     add("--to", nargs="+", default=["store"], help="store, hdf5 (as DSEC), text or evt3 (default: store)")
     add("--fps", type=positive, metavar="HZ", help="frames a second (default: as a video states)")
-    add(
-        "--times",
-        type=input_path,
-        metavar="FILE",
-        help="times of the frames, a line each (default: FOLDER/timestamps.txt)",
-    )
+    add("--times", type=input_path, metavar="FILE", help="frame times, one a line (default: INPUT/timestamps.txt)")
     add("--time-unit", choices=("us", "ms", "s"), default="us", help="unit of these times (default: us)")
     add("--size", nargs=2, type=int, metavar=("HEIGHT", "WIDTH"), help="cut and reduce the frames to this size")
     add("--upsample", action="store_true", help="interpolate frames so that nothing moves by more than 1 px a step")
     add("--grey", action="store_true", help="take colour frames as grey, which are unpolarized")
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels of raw frames: even row / odd row")
-    add(
-        "--white", type=float, metavar="LEVEL", help="level of saturation (default: the most of the first frame's bits)"
-    )
+    add("--white", type=float, metavar="LEVEL", help="saturation (default: the most of the first frame's bits)")
     add("--no-preview", action="store_true", help="write no preview video")
 
 
@@ -262,7 +248,7 @@ dv://HOST:PORT of a program that streams its events, or dv://camera""",
     add("--mosaic", metavar="'A B / C D'", help="polarizer angles of 2x2 pixels in degrees: even row / odd row")
     add("--sequence", metavar="NAME", help="sequence of an event store with several")
     add(
-        "--truth", nargs="?", type=input_name, const=BESIDE, metavar="FRAMES",
+        "--truth", nargs="?", type=input_name, const="", metavar="FRAMES",
         help="score the frames of an event store: frames.zarr or truth.zarr (default: those beside the store)",
     )  # fmt: skip
     add("--frames", action="store_true", help="use the frames of a camera with --mosaic too")

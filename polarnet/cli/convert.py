@@ -4,14 +4,14 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarnet.cli.options import READING, duration_us, reading_of, refuse
+from polarnet.cli.options import READING, duration_us, opener_of, refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.stores import is_store
 from polarnet.events.stream import Events, shifted, slice_time
 from polarnet.networks.onnx_export import TOLERANCE, export_network
 from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
-from polarnet.recordings.recording import RecordingReader, open_recording
+from polarnet.recordings.recording import RecordingReader
 from polarnet.recordings.repair import MAX_TIME
 from polarnet.recordings.source import RecordingError
 from polarnet.recordings.writers import FORMS, export_store
@@ -25,14 +25,12 @@ def convert(options: argparse.Namespace) -> None:
     """Convert a recording, or the sequences of an event store."""
     if is_store(options.file):
         _convert_store(options)
-    elif options.sequence:
-        raise ValueError("--sequence: expected an event store; leave it out")
     else:
         _convert_recording(options, Path(options.file))
 
 
 def _convert_store(options: argparse.Namespace) -> None:
-    refuse(options, "an event store", ["start", "stop", "part", *READING])
+    refuse(options, "an event store", ["start", "stop", *READING])
     store = EventStore.open(options.file)
     with run_folder(options.out, "convert") as folder:
         export_store(store, folder, options.to or "hdf5", options.sequence)
@@ -40,6 +38,7 @@ def _convert_store(options: argparse.Namespace) -> None:
 
 
 def _convert_recording(options: argparse.Namespace, file: Path) -> None:
+    refuse(options, "a recording", ["sequence"])
     form = options.to or SUFFIXES.get(options.out.suffix.lower())
     if form is None:
         raise ValueError(f"{options.out}: expected a suffix of {', '.join(SUFFIXES)}, or --to FORMAT")
@@ -48,7 +47,7 @@ def _convert_recording(options: argparse.Namespace, file: Path) -> None:
     start_us, stop_us = duration_us(options, "start", "500ms") or 0, duration_us(options, "stop", "500ms")
     if stop_us is not None and stop_us <= start_us:
         raise ValueError(f"expected --stop after --start, got {start_us} to {stop_us} us")
-    reader = open_recording(file, **reading_of(options))
+    reader = opener_of(options)(file)
     span = _Span(start_us, stop_us)
     with replaced(options.out) as temporary:
         FORMS[form][1](temporary, span.chunks(reader))

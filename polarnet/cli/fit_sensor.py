@@ -4,7 +4,7 @@ import argparse
 import re
 from pathlib import Path
 
-from polarnet.characterization.fit import SensorFit, fit_sensor
+from polarnet.characterization.fit import CONSTANT_LIGHT_PARAMETERS, FLICKER_PARAMETERS, SensorFit, fit_sensor
 from polarnet.characterization.flicker import Flicker
 from polarnet.cli.options import reading_of
 from polarnet.cli.project import settings_root, working_folder
@@ -14,20 +14,9 @@ from polarnet.terminal.progress import ProgressBar
 
 WRITTEN_BY = "# Written by `polarnet fit-sensor`"
 MIDDLE_DN = 127.5
-UNITS = {
-    "contrast_threshold_on": "log intensity",
-    "contrast_threshold_off": "log intensity",
-    "contrast_threshold_sigma_on": "log intensity",
-    "contrast_threshold_sigma_off": "log intensity",
-    "contrast_threshold_correlation": "",
-    "cutoff_hz": "Hz",
-    "refractory_period_us": "us",
-    "leak_rate_hz": "Hz",
-    "shot_noise_rate_hz": "Hz",
-    "hot_pixel_share": "",
-    "hot_pixel_rate_hz": "Hz",
-}
-"""Unit of each parameter, in the order of the table."""
+PARAMETERS = (*FLICKER_PARAMETERS, "refractory_period_us", "leak_rate_hz", *CONSTANT_LIGHT_PARAMETERS)
+UNITS = {"on": "log intensity", "off": "log intensity", "us": "us", "hz": "Hz"}
+"""Unit of a parameter by the last word of its name; others have none."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -35,10 +24,8 @@ def run(options: argparse.Namespace) -> None:
     check_options(options)
     preset = _preset_path(options.name)
 
-    paths = [*([options.static] if options.static else []), *(options.flicker or [])]
-    recordings = [
-        read_recording(path, **reading_of(options)).events for path in ProgressBar(paths, "read", unit="recording")
-    ]
+    paths, reading = [*([options.static] if options.static else []), *(options.flicker or [])], reading_of(options)
+    recordings = [read_recording(path, **reading).events for path in ProgressBar(paths, "read", unit="recording")]
     static = recordings.pop(0) if options.static else None
     static_light = MIDDLE_DN if options.static_light is None else options.static_light
     flickers = [
@@ -80,8 +67,9 @@ def check_options(options: argparse.Namespace) -> None:
 
 def _rows(fit: SensorFit) -> list[tuple[str, str, str, str]]:
     rows = []
-    for name, unit in UNITS.items():
+    for name in PARAMETERS:
         if one := fit.estimates.get(name):
+            unit = UNITS.get(name.rpartition("_")[2], "")
             rows.append((name, f"{one.value:.4g} {unit}".rstrip(), f"{one.error:.2g}", one.source))
         else:
             rows.append((name, "not estimated", "", f"{fit.missing[name]}; the default stays"))

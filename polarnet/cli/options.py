@@ -1,21 +1,29 @@
 """Values of the options that several commands share."""
 
 import argparse
+import functools
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from polarnet.recordings.arrangements import Open
 from polarnet.recordings.noise import FOUND, Cleaning
+from polarnet.recordings.recording import open_recording
 
-READING = ("format", "height", "width")
-"""Options that describe a camera's file where the file itself does not."""
+READING = ("part", "format", "height", "width")
+"""Options that describe a camera's file, as arguments of `open_recording`."""
 CLEANING = ("hot_pixels", "background")
 
 
 def reading_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Values of `READING` and --part, as arguments of `open_recording`."""
-    return {name: getattr(options, name) for name in ("part", *READING)}
+    """Values of `READING`."""
+    return {name: getattr(options, name) for name in READING}
+
+
+def opener_of(options: argparse.Namespace) -> Open:
+    """`open_recording` with these values."""
+    return functools.partial(open_recording, **reading_of(options))
 
 
 def cleaning_of(options: argparse.Namespace) -> Cleaning:

@@ -76,7 +76,7 @@ def _remove_without_results(partial: Path) -> None:
     if any(path.is_file() for entry in _entries(partial) for path in (entry, *entry.rglob("*"))):
         print(f"files of the unfinished run: {partial}", file=sys.stderr)
     else:
-        shutil.rmtree(partial)
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:

@@ -29,19 +29,10 @@ DVC = "[core]\n    analytics = false\n    no_scm = true\n"  # `dvc init --force`
 
 
 def _clone() -> Path | None:
+    """The nearest folder at or above the current one with params.yaml and dvc.yaml."""
     here = Path.cwd().resolve()
     files = ("params.yaml", "dvc.yaml")
     return next((path for path in (here, *here.parents) if all((path / file).exists() for file in files)), None)
-
-
-def project_root() -> Path:
-    """The nearest folder at or above the current one with params.yaml and dvc.yaml; FileNotFoundError if none has."""
-    if clone := _clone():
-        return clone
-    raise FileNotFoundError(
-        f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {Path.cwd()} or above; "
-        f"run this command inside a clone"
-    )
 
 
 def settings_root() -> Path:
@@ -56,7 +47,11 @@ def working_folder() -> Path:
 
 def preset(options: argparse.Namespace) -> None:
     """Write a preset into params.yaml."""
-    root = project_root()
+    if (root := _clone()) is None:
+        raise FileNotFoundError(
+            f"expected a clone of polarnet, found no params.yaml beside a dvc.yaml in {Path.cwd()} or above; "
+            f"run this command inside a clone"
+        )
     changed = write_preset(root, options.name)
     print(f"params.yaml now holds {group_of(root, options.name)} {options.name}: {len(changed)} values changed")
     for line in changed:

@@ -34,8 +34,7 @@ class Recorded(NamedTuple):
     name: str
     channels: Sequence[Events]
     truth: Truth
-    notes: list[str]
-    """Warnings about its clock and its noise, a sentence each."""
+    notes: list[str]  # warnings about its clock and its noise, a sentence each
 
 
 def make_recorded_set(root: Path, folder: Path, mosaic: Mosaic, cleaning: Cleaning) -> list[str]:

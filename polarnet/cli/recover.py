@@ -7,11 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polarnet.cli.commands import BESIDE
-from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, reading_of, refuse
+from polarnet.cli.options import CLEANING, READING, cleaning_of, duration_us, given, opener_of, refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.project import settings_root
-from polarnet.cli.stores import is_store
+from polarnet.cli.stores import is_store, truth_of
 from polarnet.config.pipeline import setup_of
 from polarnet.config.tree import load
 from polarnet.events.streaming import TRAINED_WINDOW_US, WindowRule
@@ -21,7 +20,7 @@ from polarnet.pictures.images import extension, picture_extensions
 from polarnet.recordings.arrangements import Input
 from polarnet.recordings.noise import Cleaner
 from polarnet.recordings.polarizers import ChannelCheck
-from polarnet.recordings.recording import is_recording, open_recording
+from polarnet.recordings.recording import is_recording
 from polarnet.recordings.repair import HARMLESS
 from polarnet.recordings.source import REPAIRS
 from polarnet.recovery.inputs import open_channels, open_frames, open_live, open_rotating, rotation_of
@@ -30,18 +29,15 @@ from polarnet.recovery.writer import OUTPUTS, RecoveryWriter
 from polarnet.runtime.machine import precision_on
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic, StokesFrames, parse_mosaic
 from polarnet.storage.events import EventStore
-from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
+from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.suggestions import did_you_mean
 
 WHOLE_METHOD, PAST_METHOD = "registered", "ours"
 """Methods unless --method names one: over a whole recording, and from window to window."""
 ROTATING_METHOD = "rotating_polarizer"
-RECONSTRUCT = "highpass"
-"""Method whose intensities are the S0 of the video."""
-ARRANGEMENTS = ("angles", "mosaic", "sequence")
-"""Options that say where the polarizers are."""
-NOT_LIVE = ("angles", "sequence", "truth", "frames", "part", *READING)
-"""Options without a meaning for live input."""
+RECONSTRUCT = "highpass"  # method whose intensities are the S0 of the video
+ARRANGEMENTS = ("angles", "mosaic", "sequence")  # options that say where the polarizers are
+NOT_LIVE = ("angles", "sequence", "truth", "frames", *READING)  # options without a meaning for live input
 
 
 def run(options: argparse.Namespace) -> None:
@@ -95,7 +91,7 @@ def rotating(options: argparse.Namespace) -> None:
     """Fit every half turn of a rotating polarizer, write the files and print facts about the input and the result."""
     rotation = rotation_of(options.rate, options.triggers, options.start_angle)
     step_us = duration_us(options, "step", "10ms")
-    source, rotation = open_rotating(options.input, rotation, functools.partial(open_recording, **reading_of(options)))
+    source, rotation = open_rotating(options.input, rotation, opener_of(options))
     rule = WindowRule(step_us or max(1, round(rotation.half_turn_us)), None)
     method = METHODS[ROTATING_METHOD]
     recoverer = method.open(replace(setup_of(load(settings_root()), method), rotation=rotation))
@@ -126,11 +122,9 @@ def print_results(facts: Mapping[str, str], notes: Sequence[str], page: Path) ->
 
 def _network_method(options: argparse.Namespace, setup_of: Callable[[Method], Setup]) -> str:
     """The network over the whole recording, or from window to window: live, or with another network."""
-    if options.live:
-        return PAST_METHOD
     whole = METHODS[WHOLE_METHOD]
     other = options.weights and why_absent(whole, replace(setup_of(whole), weights=options.weights))
-    return PAST_METHOD if other else WHOLE_METHOD
+    return PAST_METHOD if options.live or other else WHOLE_METHOD
 
 
 def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner) -> Input:
@@ -138,7 +132,7 @@ def _input(options: argparse.Namespace, mosaic: Mosaic | None, cleaner: Cleaner)
     if options.live:
         source = open_live(options.input[0], mosaic, options.idle)
     else:
-        open_file = functools.partial(open_recording, **reading_of(options))
+        open_file = opener_of(options)
         paths = [Path(path) for path in options.input]
         source = open_channels(paths, options.angles, mosaic, options.sequence, open_file)
     return source._replace(pieces=cleaner.clean(source.pieces, live=source.live))
@@ -150,7 +144,7 @@ def _frames_of(options: argparse.Namespace, mosaic: Mosaic | None) -> StokesFram
         return None
     if mosaic is None:
         raise ValueError("--frames: expected --mosaic, the polarizers of the camera's pixels")
-    return open_frames(Path(options.input[0]), mosaic, functools.partial(open_recording, **reading_of(options)))
+    return open_frames(Path(options.input[0]), mosaic, opener_of(options))
 
 
 def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
@@ -160,10 +154,7 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
     path = options.input[0]
     if not is_store(path):
         raise ValueError("--truth: expected an event store; leave out --truth")
-    truth = truth_beside(path) if options.truth == BESIDE else options.truth
-    if truth is None:
-        raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {path}, there is none; name them")
-    return open_truth(truth, options.sequence or EventStore.open(path).sequences[0])
+    return truth_of(path, options.sequence or EventStore.open(path).sequences[0], options.truth)
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -187,4 +178,4 @@ def check_options(options: argparse.Namespace) -> None:
     if not first.is_dir() or is_recording(first):
         refuse(options, "a recording", ["sequence"])
     else:
-        refuse(options, "a store or a folder", ["part", *READING])
+        refuse(options, "a store or a folder", READING)

@@ -14,7 +14,7 @@ import torch
 
 from polarnet import __version__
 from polarnet.cli.options import refuse
-from polarnet.cli.outputs import MARKER, run_folder
+from polarnet.cli.outputs import run_folder
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.cli.simulated_files import FORMATS, STORE, Output, write_simulation
 from polarnet.clips.video import moving_pieces, video_pieces
@@ -79,11 +79,7 @@ def simulate(options: argparse.Namespace) -> None:
         try:
             facts = _run(config, clip, times, Output(partial, clip.name, formats, gamma, attributes))
         except BaseException:
-            for entry in partial.iterdir():  # half a simulation is of no use
-                if entry.is_dir():
-                    shutil.rmtree(entry)
-                elif entry.name != MARKER:
-                    entry.unlink()
+            shutil.rmtree(partial)  # half a simulation is of no use
             raise
     for key, value in facts.items():
         print(f"{key:11s} {value}")
@@ -97,8 +93,6 @@ def _check(options: argparse.Namespace, inputs: list[str], overrides: list[str],
         h5py_module()  # where it is missing, say so before the simulation
     if len(inputs) != 1:
         raise ValueError(f"expected one picture, video or folder of frames before KEY=VALUE, got {len(inputs)}")
-    if options.fps is not None and not 0 < options.fps <= 1e6:
-        raise ValueError(f"--fps: expected more than 0 and at most 1e6 Hz, got {options.fps:g}")
     if options.size and min(options.size) < 2:
         raise ValueError(f"--size: expected at least 2 rows and columns, got {options.size[0]} {options.size[1]}")
     if options.times and options.fps:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from polarnet import stokes
 from polarnet.clips.video import Piece
@@ -41,34 +40,22 @@ class Output(NamedTuple):
     attributes: dict[str, Any]  # of the event store
 
 
-class EventSpool:
-    """Events of a sequence on disk while its pieces arrive: a file for each column of each channel."""
+def _spool(folder: Path, channels: Sequence[Events]) -> None:
+    """Append a piece of every channel to a file for each column of each channel."""
+    for k, events in enumerate(channels):
+        for name in COLUMNS:
+            with (folder / f"{k}.{name}").open("ab") as file:
+                file.write(getattr(events, name).numpy().tobytes())
 
-    def __init__(self, folder: Path):
-        self.folder = folder
-        self._sizes: list[tuple[int, int]] = []
-        folder.mkdir(parents=True)
 
-    def append(self, channels: Sequence[Events]) -> None:
-        """Add a piece of every channel."""
-        self._sizes = [(events.height, events.width) for events in channels]
-        for k, events in enumerate(channels):
-            for name in COLUMNS:
-                with (self.folder / f"{k}.{name}").open("ab") as file:
-                    file.write(getattr(events, name).numpy().tobytes())
-
-    def channels(self) -> list[Events]:
-        """All events so far; their columns stay on disk until they are used."""
-
-        def column(channel: int, name: str) -> Tensor:
-            file, dtype = self.folder / f"{channel}.{name}", COLUMNS[name]
-            values = np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype)  # no map is empty
-            return torch.from_numpy(values)
-
-        return [
-            Events(column(k, "t"), column(k, "x"), column(k, "y"), column(k, "p"), height, width)
-            for k, (height, width) in enumerate(self._sizes)
-        ]
+def _spooled(folder: Path, channel: int, height: int, width: int) -> Events:
+    """All events of a channel in these files; its columns stay on disk until they are used."""
+    columns = []
+    for name, dtype in COLUMNS.items():
+        file = folder / f"{channel}.{name}"
+        columns.append(np.memmap(file, dtype, mode="c") if file.stat().st_size else np.empty(0, dtype))  # no empty map
+    t, x, y, p = map(torch.from_numpy, columns)
+    return Events(t, x, y, p, height, width)
 
 
 def write_simulation(
@@ -80,7 +67,8 @@ def write_simulation(
     `total` is the expected number of true frames; None: unknown. ValueError for a simulation of more than 71 minutes or
     without duration.
     """
-    spool = EventSpool(output.folder / SPOOL)
+    spool, size = output.folder / SPOOL, (0, 0)
+    spool.mkdir()
     truth = GrowingColumns(output.folder / TRUTH, FRAMES_PER_CHUNK, False, TRUTH_CONVENTIONS)
     duration_us, frames, polarized = 0, 0, False
     with ProgressBar(total=total, desc="simulate", unit="frame") as bar:
@@ -88,7 +76,8 @@ def write_simulation(
             duration_us = piece.stop_us
             if duration_us > MAX_DURATION_US:
                 raise ValueError(f"expected at most {MAX_DURATION_US / 6e7:.0f} minutes, got more; cut the clip")
-            spool.append(piece.events)
+            size = piece.events[0].height, piece.events[0].width
+            _spool(spool, piece.events)
             for t_us, frame in zip(piece.t_us.tolist(), piece.stokes, strict=True):
                 dolp = quantise("dolp", stokes.dolp(frame).clamp(0, 1))
                 s0, aolp = quantise("s0", frame[0].clamp(0, 1)), quantise("aolp", stokes.aolp(frame))
@@ -99,7 +88,7 @@ def write_simulation(
     truth.flush()
     if duration_us == 0:
         raise ValueError("expected at least two frames, got one: nothing changes, so no pixel fires")
-    channels = leave_sensors(spool.channels(), camera, duration_us)
+    channels = leave_sensors([_spooled(spool, k, *size) for k in range(stokes.NUM_CHANNELS)], camera, duration_us)
     files = _write_events(channels, camera, duration_us, output)
     if output.gamma is not None:
         frames_on_disk = open_truth(output.folder / TRUTH, "")
@@ -108,7 +97,7 @@ def write_simulation(
             (output.folder / PICTURE).write_bytes(encode_png(busiest))
             files += [VIDEO, PICTURE]
     files.append(TRUTH)
-    shutil.rmtree(spool.folder)
+    shutil.rmtree(spool)
     counts = dict(zip(stokes.POLARIZER_ANGLES_DEG, map(len, channels), strict=True))
     events, seconds = sum(counts.values()), duration_us * 1e-6
     facts = {

@@ -1,20 +1,19 @@
 """Commands that look at stores and recordings: inspect, view, video, replay, verify."""
 
 import argparse
-import functools
 import os
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from polarnet.cli.options import READING, reading_of, refuse
+from polarnet.cli.options import READING, opener_of, refuse
 from polarnet.config.origins import origin_problems
 from polarnet.networks.base.checkpoint import load_checkpoint
 from polarnet.recordings.inspection import findings, inspect_recording
 from polarnet.recordings.live import replay as replay_events
 from polarnet.recordings.noise import write_hot_pixels
-from polarnet.recordings.recording import is_recording, open_recording
+from polarnet.recordings.recording import is_recording
 from polarnet.reports.player import write_player
 from polarnet.reports.preview import write_true_video
 from polarnet.reports.recordings import recording_picture
@@ -25,7 +24,7 @@ from polarnet.storage.frames import FrameStore, SplitStore
 from polarnet.storage.groups import is_url, open_group
 from polarnet.storage.parts import Store, unknown_sequence
 from polarnet.storage.scenes import SceneStore
-from polarnet.storage.true_frames import open_truth, truth_beside
+from polarnet.storage.true_frames import TrueFrames, open_truth, truth_beside
 from polarnet.training.engine.recorder import read_running
 
 STORES: dict[str, type[Store]] = {store.FORMAT: store for store in (EventStore, FrameStore, SceneStore)}
@@ -36,11 +35,11 @@ UNFINISHED = (".tmp", ".partial")
 def inspect(options: argparse.Namespace) -> None:
     """Print a summary of a camera's file and draw it, or list the sequences of a store."""
     if is_store(options.file):
-        refuse(options, "a store", ["part", *READING])
+        refuse(options, "a store", READING)
         print(*_listing(options.file), sep="\n")
         return
     file = Path(options.file)
-    inspection = inspect_recording(open_recording(file, **reading_of(options)))
+    inspection = inspect_recording(opener_of(options)(file))
     print(*findings(inspection), sep="\n")
     folder = options.out or Path("outputs", "inspect")
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,13 +54,11 @@ def view(options: argparse.Namespace) -> None:
     """Open the page of a folder that has one, such as a recovery; else write one that plays a store or a recording."""
     page = options.path / "index.html"
     if page.is_file():
-        refuse(options, "a folder with a page", ["sequence", "out", "part", *READING])
+        refuse(options, "a folder with a page", ["sequence", "out", *READING])
     else:
         recording = is_recording(options.path)
-        unused = ["sequence"] if recording else ["part", *READING]
-        refuse(options, "a recording" if recording else "a store or a folder", unused)
-        open_file = functools.partial(open_recording, **reading_of(options))
-        films = films_of(options.path, options.sequence or (), open_file)
+        refuse(options, *(("a recording", ["sequence"]) if recording else ("a store or a folder", READING)))
+        films = films_of(options.path, options.sequence or (), opener_of(options))
         page = options.out or Path("outputs", "view", f"{options.path.resolve().name}.html")
         page.parent.mkdir(parents=True, exist_ok=True)
         write_player(page, f"{options.path}", films, {"command": options.command_line})
@@ -76,15 +73,10 @@ def video(options: argparse.Namespace) -> None:
     name = store.sequences[0] if options.sequence is None and len(store.sequences) == 1 else options.sequence
     if name not in store.sequences:
         raise ValueError(f"{options.store}: {unknown_sequence(name, store.sequences)}")
-    truth = options.truth or truth_beside(options.store)
-    if truth is None:
-        raise ValueError(
-            f"{options.store}: expected frames.zarr or truth.zarr beside it, there is none; name the true frames with "
-            f"--truth, or draw predictions with `polarnet recover {options.store}`"
-        )
+    truth = truth_of(options.store, name, options.truth)
     out = options.out or Path("outputs", "video", f"{name}.mp4")
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_true_video(out, store.read(name), open_truth(truth, name))
+    write_true_video(out, store.read(name), truth)
     print(f"video {out}")
 
 
@@ -108,6 +100,13 @@ def verify(options: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
+def truth_of(store: str, sequence: str, frames: str | None) -> TrueFrames:
+    """True frames of a stored sequence from `frames`, else from those beside the store; ValueError without any."""
+    if not (place := frames or truth_beside(store)):
+        raise ValueError(f"--truth: expected frames.zarr or truth.zarr beside {store}, there is none; name them")
+    return open_truth(place, sequence)
+
+
 def is_store(path: str) -> bool:
     """Whether a path, or an fsspec URL, is that of a store."""
     return "://" in path or (Path(path) / "zarr.json").is_file()
@@ -118,39 +117,33 @@ def verified(path: str) -> Iterator[tuple[str, list[str]]]:
 
     Unfinished and temporary folders are not read. ValueError for a file of another kind.
     """
-    if "://" in path or Path(path).suffix == ".zarr":
-        yield path, _store_problems(path)
-    elif not Path(path).is_dir():
-        yield path, _file_problems(Path(path))
-    else:
-        for place, folders, files in os.walk(path):
-            here = Path(place)
-            if {SUMS, ORIGIN} & {*files}:
-                yield place, [*(changed_files(here) if SUMS in files else ()), *origin_problems(here)]
-            for store in sorted(name for name in folders if name.endswith(".zarr")):
-                yield str(here / store), _store_problems(str(here / store))
-            folders[:] = sorted(name for name in folders if not name.endswith((".zarr", *UNFINISHED)))
-            for file in (here / name for name in sorted(files) if Path(name).suffix in FILES):
-                if file.suffix == ".pt" or file.with_suffix(".json").exists():
-                    yield str(file), _file_problems(file)
+    if is_url(path) or not Path(path).is_dir() or Path(path).suffix == ".zarr":
+        yield path, _problems(path)
+        return
+    for place, folders, files in os.walk(path):
+        here = Path(place)
+        if {SUMS, ORIGIN} & {*files}:
+            yield place, [*(changed_files(here) if SUMS in files else ()), *origin_problems(here)]
+        stores = sorted(here / name for name in folders if name.endswith(".zarr"))
+        written = sorted(here / name for name in files if Path(name).suffix in FILES)
+        written = [file for file in written if file.suffix == ".pt" or file.with_suffix(".json").exists()]
+        yield from ((str(one), _problems(str(one))) for one in (*stores, *written))
+        folders[:] = sorted(name for name in folders if not name.endswith((".zarr", *UNFINISHED)))
 
 
-def _store_problems(path: str) -> list[str]:
+def _problems(path: str) -> list[str]:
+    """Problems of a store or a checkpoint."""
+    suffix = Path(path).suffix
+    if not (is_url(path) or suffix in (".zarr", *FILES)):
+        raise ValueError(f"{path}: expected a store, a folder, a checkpoint (.safetensors) or running.pt")
     try:
+        if suffix in FILES:
+            FILES[suffix](Path(path))
+            return []
         kind = _kind_of(path)
     except (FileNotFoundError, ValueError) as error:
         return [str(error)]
     return [*kind.verify(path), *([] if is_url(path) else origin_problems(Path(path)))]
-
-
-def _file_problems(file: Path) -> list[str]:
-    if file.suffix not in FILES:
-        raise ValueError(f"{file}: expected a store, a folder, a checkpoint (.safetensors) or running.pt")
-    try:
-        FILES[file.suffix](file)
-    except (FileNotFoundError, ValueError) as error:
-        return [str(error)]
-    return []
 
 
 def _kind_of(path: str) -> type[Store]:

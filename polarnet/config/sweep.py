@@ -42,7 +42,7 @@ class SweepTable(Callback):
         ranked = [row for row in rows if row["validation_mse"] is not None]
         if ranked:
             # every stage imports this module, and only a sweep draws
-            from polarnet.reports.charts import sweep_chart
+            from polarnet.reports.figures import sweep_chart
             from polarnet.reports.maps import png
 
             drawn = {row["point"]: (row["validation_mse"], row["validation_mse_std"] or 0.0) for row in ranked}

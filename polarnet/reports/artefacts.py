@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from polarnet.reports.legend import legend_of
+from polarnet.reports.legend import Legend, legend_of
 from polarnet.reports.tables import Table, score_table
 from polarnet.runtime.machine import usable_cores
 from polarnet.storage.panels import Panel, read_panel
 from polarnet.terminal.installation import versions
 
 SIMULATED = "simulated"  # name of the pipeline's own test set
+TITLES = {"measured": "Measured polarization", "recordings": "Real targets"}  # of the pipeline's further test sets
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,7 @@ class ReportPaths:
 
     images: Path
     scenes: Path
-    train: Path
-    """Holds a folder for each trained network."""
+    train: Path  # holds a folder for each trained network
     benchmark: Path
 
     @property
@@ -37,11 +37,24 @@ class Results(NamedTuple):
     """Benchmark results on one test set."""
 
     name: str
-    metrics: Mapping[str, Mapping[str, Any]]
-    """Scores and costs by row."""
-    details: Mapping[str, Any]
-    """Content of details.json: the test data scored, and each scene's mean."""
+    metrics: Mapping[str, Mapping[str, Any]]  # scores and costs by row
+    details: Mapping[str, Any]  # content of details.json: the test data scored, and each scene's mean
     panels: Sequence[Panel]
+
+    @property
+    def title(self) -> str:
+        """Title of the test set on a page; the name for a set of the user's."""
+        return TITLES.get(self.name, self.name)
+
+    @property
+    def legend(self) -> Legend:
+        """Labels and colours that name the networks behind the rows."""
+        return legend_of(self.details["weights"])
+
+    @property
+    def table(self) -> Table:
+        """The scores, with a note on the windows that count."""
+        return score_table(self.metrics, labels=self.legend.labels, warmup_windows=self.details["warmup_windows"])
 
 
 def read_results(folder: Path) -> Results:
@@ -52,26 +65,16 @@ def read_results(folder: Path) -> Results:
     return Results(details.get("set", folder.name), metrics, details, panels)
 
 
-def results_table(results: Results) -> Table:
-    """The scores of a test set, with labels that name the networks and a note on the windows that count."""
-    labels, warmup_windows = legend_of(results.details["weights"]).labels, results.details["warmup_windows"]
-    return score_table(results.metrics, labels=labels, warmup_windows=warmup_windows)
-
-
 def _json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """Provenance of a run's results, as shown on the page."""
 
-    command: str
-    """Command that reproduces the results."""
-    parameters: Mapping[str, Any]
-    """The params.yaml in use: sections and single values."""
-    facts: Mapping[str, str]
-    """Seed, commit, machine, versions."""
+    command: str  # repeats it
+    parameters: Mapping[str, Any]  # the params.yaml in use: sections and single values
+    facts: Mapping[str, str]  # seed, commit, machine, versions
 
 
 def facts(root: Path) -> dict[str, str]:

@@ -28,11 +28,9 @@ NETWORKS = {name: Network(METHODS[name].label, METHODS[name].colour) for name in
 }
 """Networks by their name in a checkpoint."""
 
-NAMED_BY_NETWORK = ("e2v", "paper", "ours")
-"""Rows whose key does not name their network."""
+NAMED_BY_NETWORK = ("e2v", "paper", "ours")  # rows whose key does not name their network
 
-OTHER_COLOUR = "#4aa37c"
-"""Colour of rows in older results that polarnet no longer has."""
+OTHER_COLOUR = "#4aa37c"  # colour of rows in older results that polarnet no longer has
 
 GAINS = (
     "The same intensities, each polarizer's scale solved from I0 + I90 = I45 + I135 before the Stokes formula. Nothing "

@@ -9,8 +9,6 @@ import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -71,7 +69,6 @@ def angle_image(dolp: Float[Tensor, "h w"], aolp: Float[Tensor, "h w"]) -> UInt8
 def png(figure: Figure) -> bytes:
     """Encode a figure as a PNG without a date or software name: the same figure gives the same bytes."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
     compression = {"compress_level": 9}
     figure.savefig(buffer, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}, pil_kwargs=compression)
     return buffer.getvalue()
@@ -81,7 +78,6 @@ def write_figure(figure: Figure, path: Path) -> None:
     """Write a figure as PATH.png and as PATH.pdf, whose text and lines scale; the same figure gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_name(f"{path.name}.png").write_bytes(png(figure))
-    FigureCanvasPdf(figure)
     unstamped = dict.fromkeys(("Creator", "Producer", "CreationDate"))
     figure.savefig(path.with_name(f"{path.name}.pdf"), dpi=DOTS_PER_INCH, metadata=unstamped)
 

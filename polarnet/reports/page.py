@@ -11,14 +11,13 @@ from markupsafe import Markup
 from ruamel.yaml import YAML
 
 from polarnet.methods import is_rotating
-from polarnet.pictures.manifest import Manifest, read_manifest
-from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results, results_table
-from polarnet.reports.charts import error_chart, reliability_chart
-from polarnet.reports.figures import comparison_figure, svg
-from polarnet.reports.legend import LABELS, Legend, glossary, in_order, legend_of, network_label, with_structure
+from polarnet.pictures.manifest import read_manifest
+from polarnet.reports.artefacts import SIMULATED, ReportPaths, Results, Run, read_results
+from polarnet.reports.figures import comparison_figure, error_chart, reliability_chart, svg
+from polarnet.reports.legend import LABELS, Legend, glossary, in_order, network_label, with_structure
 from polarnet.reports.maps import write_figure
-from polarnet.reports.player import embedded_json, panel_film, player_data, script, template
-from polarnet.reports.tables import PARTS_AND_COSTS, SET_TITLES, Scores, score_table
+from polarnet.reports.player import panel_film, player_data, template
+from polarnet.reports.tables import PARTS_AND_COSTS, Scores, score_table
 from polarnet.runtime.files import check_name
 from polarnet.storage.scenes import SceneStore
 from polarnet.training.engine.recorder import best_row, read_history
@@ -34,11 +33,6 @@ SOURCE_NAMES = {
     "folder": "of your own",
     "polarization": "of measured polarization",
 }
-SET_ABOUT = {
-    "measured": "Scenes whose polarization a camera measured, seen by a simulated event camera: real DoLP and AoLP, "
-    "simulated events.",
-    "recordings": "Captures of real targets (paper, section 4): real events, DoLP from pictures of the same camera.",
-}
 
 
 def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder: Path) -> Path:
@@ -48,7 +42,7 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
     """
     manifest, results = read_manifest(paths.images), read_results(paths.simulated)
     generated = {entry.name for entry in manifest.pictures if entry.source == GENERATED}
-    scene_of = SceneStore.open(paths.scenes).scene_of
+    scene_of, sources = SceneStore.open(paths.scenes).scene_of, Counter(one.source for one in manifest.pictures)
     panels = sorted(results.panels, key=lambda p: (scene_of[p.sequence] in generated, -float(p.truth.dolp.std())))
     others = [read_results(one) for one in sorted(paths.benchmark.glob("sets/*")) if one.name != SIMULATED]
     sets = [results._replace(panels=panels), *others]
@@ -59,7 +53,8 @@ def write_report(paths: ReportPaths, baselines: Sequence[str], run: Run, folder:
         "facts": run.facts,
         "parameters": _as_yaml(run.parameters),
         "trainings": [_training(paths.train, name) for name in (OURS, *baselines)],
-        "pictures": _pictures(manifest),
+        "manifest": manifest,
+        "sources": ", ".join(f"{count} {SOURCE_NAMES.get(source, source)}" for source, count in sources.items()),
     }
     return _write_page(folder, sets, content)
 
@@ -70,13 +65,16 @@ def write_set_page(folder: Path, title: str, command: str, notes: Sequence[str])
     `notes` are sentences for the reader of the table, such as the methods that did not run and the reasons.
     """
     results = read_results(folder)
-    weights = results.details["weights"]
-    facts = {
-        legend_of(weights).label(row): f"{file['file']} (sha256 {file['sha256'][:16]})" for row, file in weights.items()
+    content = {
+        "title": f"polarnet benchmark: {title}",
+        "scenes": _in_words(results.details["scenes"], "scene"),
+        "command": command,
+        "facts": {
+            results.legend.label(row): f"{file['file']} (sha256 {file['sha256'][:16]})"
+            for row, file in results.details["weights"].items()
+        },
+        "notes": notes,
     }
-    title = f"polarnet benchmark: {title}"
-    scenes = _in_words(results.details["scenes"], "scene")
-    content = {"title": title, "command": command, "notes": notes, "facts": facts, "scenes": scenes}
     return _write_page(folder, [results], content)
 
 
@@ -84,41 +82,30 @@ def _write_page(folder: Path, sets: Sequence[Results], content: Mapping[str, Any
     """Fill the template into index.html, and draw the first panels of each set as comparison_SET.png and .pdf."""
     results, *others = sets
     metrics, details = results.metrics, results.details
-    legend, means = legend_of(details["weights"]), details["scene_means"].get("mse", {})
-    method = OURS if OURS in metrics else _best_method(metrics)
+    legend, method = results.legend, _judged(metrics)
     folder.mkdir(parents=True, exist_ok=True)
     for one in (one for one in sets if one.panels):
         figure = comparison_figure(one.panels[:MAX_FIGURE_PANELS], legend)
         write_figure(figure, folder / f"comparison_{check_name(one.name)}")
     films = [panel_film(panel, legend) for panel in results.panels]
-    films += [panel_film(panel, legend, SET_TITLES.get(one.name, one.name)) for one in others for panel in one.panels]
-    names = [film.name for film in films]
-    worst = sorted(means.get(method, {}).items(), key=lambda item: -item[1])[:WORST_SCENES]
+    films += [panel_film(panel, legend, one.title) for one in others for panel in one.panels]
+    names, means = [film.name for film in films], details["scene_means"].get("mse", {}).get(method, {})
+    worst = sorted(means.items(), key=lambda item: -item[1])[:WORST_SCENES]
     values = {
         "notes": [],
         "parameters": None,
-        "trainings": [],
-        "pictures": None,
+        "manifest": None,
         "details": details,
         "verdict": verdict(metrics, content["scenes"], legend),
-        "scores": results_table(results),
+        "scores": results.table,
         "parts_and_costs": score_table(metrics, PARTS_AND_COSTS, legend.labels),
         "worst": [(scene, mse, next((name for name in names if name.startswith(scene)), None)) for scene, mse in worst],
         "ours": _spoken(method, legend),
         "glossary": glossary(metrics, legend),
-        "sets": [
-            {
-                "title": SET_TITLES.get(one.name, one.name),
-                "about": SET_ABOUT.get(one.name, ""),
-                "details": one.details,
-                "scores": results_table(one),
-            }
-            for one in others
-        ],
+        "sets": others,
         "errors": svg(error_chart(metrics, legend)),
         "reliability": _reliability(details, legend),
-        "player_json": embedded_json(player_data(films)) if films else None,
-        "script": script,
+        "player": player_data(films) if films else None,
     }
     path = folder / "index.html"
     path.write_text(template("page.html.jinja").render(values | dict(content)), encoding="utf-8")
@@ -134,11 +121,13 @@ def _reliability(details: Mapping[str, Any], legend: Legend) -> Markup | None:
 
 def verdict(metrics: Scores, scenes: str, legend: Legend) -> str:
     """One sentence: the error of ours on `scenes`, beside the best other method of its camera and the oracle mean."""
-    method = OURS if OURS in metrics else _best_method(metrics)
+    method = _judged(metrics)
     mse = metrics[method]["mse"]
     start = f"{_spoken(method, legend)} recovers DoLP with a mean squared error of {mse:.4f} on {scenes}"
     parts = []
-    if rival := _best_other(method, metrics):
+    own = OWN if method in OWN else (method,)
+    rivals = [row for row in with_structure(metrics) if row not in own and not is_rotating(row)]
+    if rival := min(rivals, key=lambda row: metrics[row]["mse"], default=None):
         parts.append(
             f"{_against(mse, metrics[rival]['mse'])} the best other method of this camera ({legend.label(rival)})"
         )
@@ -153,13 +142,6 @@ def _in_words(scenes: Sequence[str], noun: str, generated: Collection[str] = ())
     return f"{count} {noun}{'' if count == 1 else 's'}" + (f", {made} of them generated" if made else "")
 
 
-def _best_other(method: str, metrics: Scores) -> str | None:
-    """The row with the smallest error beside a method's: neither a constant nor another camera's, nor OWN for OURS."""
-    own = OWN if method in OWN else (method,)
-    others = [row for row in with_structure(metrics) if row not in own and not is_rotating(row)]
-    return min(others, key=lambda row: metrics[row]["mse"], default=None)
-
-
 def _spoken(method: str, legend: Legend) -> str:
     """Label for a sentence, with a capital and without the row's key."""
     label = legend.label(method).removeprefix("ours: ")
@@ -171,23 +153,10 @@ def _against(mse: float, other: float) -> str:
     return f"{abs(change)}\N{NO-BREAK SPACE}% {'lower' if change < 0 else 'higher'} than" if change else "the same as"
 
 
-def _best_method(metrics: Scores) -> str:
-    """The method with the lowest MSE; among the references if no method was run."""
-    return min(with_structure(metrics) or in_order(metrics), key=lambda row: metrics[row]["mse"])
-
-
-def _pictures(manifest: Manifest) -> dict[str, Any]:
-    """Template values of the pictures: numbers by source and split, licences, skipped files."""
-    sources = Counter(entry.source for entry in manifest.pictures)
-    return {
-        "manifest": manifest,
-        "sources": ", ".join(f"{count} {SOURCE_NAMES.get(source, source)}" for source, count in sources.items()),
-        "licences": [
-            (one.name, one.split, one.origin, one.author or "not stated", one.licence or "not stated")
-            for one in manifest.pictures
-        ],
-        "skipped": [(one.file, one.reason) for one in manifest.skipped],
-    }
+def _judged(metrics: Scores) -> str:
+    """Ours, else the method with the lowest MSE, else the best reference."""
+    rows = [OURS] if OURS in metrics else with_structure(metrics) or in_order(metrics)
+    return min(rows, key=lambda row: metrics[row]["mse"])
 
 
 def _training(folder: Path, name: str) -> tuple[str, str, int, int, str]:

@@ -43,6 +43,13 @@ function range(values) {
   return Math.max(1, sorted[Math.floor(SCENE_QUANTILE * (sorted.length - 1))]) / 255;
 }
 
+function element(tag, attributes, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(...children);
+  return made;
+}
+
 function option(select, labels, chosen) {
   select.replaceChildren(...labels.map((label, i) => new Option(label, i, i === chosen, i === chosen)));
 }
@@ -120,19 +127,11 @@ class Player {
     this.shown = this.maps.filter((map) => ["events", "s0", quantity].includes(map.kind) || map.source === "truth");
     const titled = (map) => map.kind === "events" ? "Events" : map.source === "truth" ? `True ${TITLES[map.kind]}` : map.source;
     this.panes = this.shown.map((map) => {
-      const figure = document.createElement("figure");
-      const caption = document.createElement("figcaption");
-      const value = document.createElement("span");
-      const pane = document.createElement("div");
-      const canvas = document.createElement("canvas");
-      Object.assign(canvas, { width: scene.width, height: scene.height });
-      canvas.setAttribute("role", "img");
-      canvas.setAttribute("aria-label", `${titled(map)}${map.kind === "error" ? `: ${TITLES[map.kind]}` : ""}, scene ${scene.name}`);
-      pane.className = "pane";
-      pane.append(canvas);
-      caption.append(titled(map), value);
-      figure.append(caption, pane);
-      return { map, figure, value, canvas, title: titled(map) };
+      const title = titled(map), value = element("span", {});
+      const label = `${title}${map.kind === "error" ? `: ${TITLES[map.kind]}` : ""}, scene ${scene.name}`;
+      const canvas = element("canvas", { width: scene.width, height: scene.height, role: "img", "aria-label": label });
+      const caption = element("figcaption", {}, title, value);
+      return { map, value, canvas, title, figure: element("figure", {}, caption, element("div", { class: "pane" }, canvas)) };
     });
     this.find("panes").replaceChildren(...this.panes.map((pane) => pane.figure));
     this.columns();
@@ -165,12 +164,9 @@ class Player {
     };
     const kinds = [...new Set(this.shown.map((map) => map.kind))].filter((kind) => ends[kind]);
     this.find("legend").replaceChildren(...kinds.map((kind) => {
-      const entry = document.createElement("span"), bar = document.createElement("canvas");
-      Object.assign(bar, { width: 128, height: 1, className: "bar" });
-      bar.setAttribute("aria-hidden", "true");
+      const bar = element("canvas", { width: 128, height: 1, class: "bar", "aria-hidden": "true" });
       this.paint(bar, { kind, values: Float32Array.from({ length: 128 }, (_, i) => (2 * i + 1) * this.end(kind)) }, 0);
-      entry.append(ends[kind][0], bar, ends[kind][1]);
-      return entry;
+      return element("span", {}, ends[kind][0], bar, ends[kind][1]);
     }));
   }
 
@@ -212,7 +208,6 @@ class Player {
     const within = (value) => Math.min(100, Math.max(0, value));
     Object.assign(this.view, changes);
     this.view = { zoom: this.view.zoom, x: within(this.view.x), y: within(this.view.y) };
-    this.find("zoom").value = this.view.zoom;
     for (const [name, unit] of [["zoom", ""], ["x", "%"], ["y", "%"]]) this.root.style.setProperty(`--${name}`, this.view[name] + unit);
     this.mark();
   }

@@ -5,9 +5,7 @@ sine of twice the angle, because a lossy picture of the angle itself would blur 
 """
 
 import base64
-import json
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +15,6 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup
 from torch import Tensor
 
 from polarnet.reports.legend import Legend, with_structure
@@ -52,27 +49,16 @@ def template(name: str) -> Template:
     environment = Environment(
         loader=PackageLoader("polarnet.reports", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     return environment.get_template(name)
-
-
-def embedded_json(content: Any) -> Markup:
-    """JSON for a script element; `<` is escaped, so that no text can end the element."""
-    return Markup(json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"))
-
-
-def script(name: str) -> Markup:
-    """A JavaScript file of this package."""
-    return Markup((files("polarnet.reports") / name).read_text(encoding="utf-8"))
 
 
 class Map(NamedTuple):
     """One quantity of a scene over its frames."""
 
-    source: str
-    """Label of its origin: a method, the truth, or a recording."""
+    source: str  # label of its origin: a method, the truth, or a recording
     kind: Kind
-    frames: UInt8[np.ndarray, "n h w"]
-    """Bytes in the steps of `polarnet.storage.panels`."""
+    frames: UInt8[np.ndarray, "n h w"]  # bytes in the steps of `polarnet.storage.panels`
 
 
 class Film(NamedTuple):
@@ -85,18 +71,12 @@ class Film(NamedTuple):
 
 def panel_film(panel: Panel, legend: Legend, title: str = "") -> Film:
     """The film of a benchmark's panel: events, truth, ours, and the other methods that are no constants."""
-    truth = panel.truth
-    maps = [
-        Map("Events", "events", panel.film_events.numpy()),
-        Map(TRUTH, "s0", panel.film_s0.numpy()),
-        *([] if truth.film_aolp is None else [Map(TRUTH, "aolp", truth.film_aolp.numpy())]),
-        Map(TRUTH, "dolp", truth.film_dolp.numpy()),
-    ]
-    for method in sorted(with_structure(panel.predictions), key=lambda method: method != "ours"):
-        shown = panel.predictions[method]
-        maps.append(Map(legend.label(method), "dolp", shown.film_dolp.numpy()))
-        if shown.film_aolp is not None:
-            maps.append(Map(legend.label(method), "aolp", shown.film_aolp.numpy()))
+    methods = sorted(with_structure(panel.predictions), key=lambda method: method != "ours")
+    sources = [(TRUTH, panel.truth), *((legend.label(method), panel.predictions[method]) for method in methods)]
+    maps = [Map("Events", "events", panel.film_events.numpy()), Map(TRUTH, "s0", panel.film_s0.numpy())]
+    for source, shown in sources:
+        films: dict[Kind, Tensor | None] = {"aolp": shown.film_aolp, "dolp": shown.film_dolp}
+        maps += [Map(source, kind, film.numpy()) for kind, film in films.items() if film is not None]
     return Film(f"{title}: {panel.sequence}" if title else panel.sequence, panel.film_t_us.tolist(), maps)
 
 
@@ -119,10 +99,8 @@ def write_player(
     video: str | None = None,
 ) -> Path:
     """Write a page with the player, and below it `facts`; `video` names a file beside the page."""
-    player = embedded_json(player_data(films))
-    page = template("viewer.html.jinja").render(
-        title=title, player_json=player, facts=facts, notes=notes, video=video, script=script
-    )
+    player = player_data(films)
+    page = template("viewer.html.jinja").render(title=title, player=player, facts=facts, notes=notes, video=video)
     with replaced(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path

@@ -45,8 +45,7 @@ TEXT_COLOUR, EDGE_COLOUR = (31, 35, 40), (200, 200, 200)
 SCALE_INERTIA = 0.9  # share of the previous picture's full scale of events, which prevents flicker
 EMPTY = 60  # pixels between the text below a picture and the colour bar, or there is no bar
 
-Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]
-"""Maps of a row of a sheet, by caption."""
+Captioned: TypeAlias = Mapping[str, UInt8[np.ndarray, "h w 3"]]  # maps of a row of a sheet, by caption
 
 
 class VideoWriter:

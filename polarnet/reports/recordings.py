@@ -14,7 +14,7 @@ from polarnet.captures.targets import Calibrated
 from polarnet.events.representations import event_tensor, polarity_sums
 from polarnet.events.stream import Events, slice_time
 from polarnet.recordings.inspection import Inspection
-from polarnet.reports.figures import LIGHT, show_picture, tile_grid
+from polarnet.reports.figures import show_picture, tile_grid
 from polarnet.reports.maps import (
     dolp_image,
     encode_png,
@@ -68,7 +68,7 @@ def draw_sequence(events: Sequence[Events], frames: Frames, path: Path) -> None:
         pictures = [event_image(tensor, full_scale) for tensor in tensors]
         pictures += [intensity_image(plane / white) for plane in frames.intensity[k]]
         for axes, picture in zip(column, [*pictures, dolp_image(frames.dolp[k])], strict=True):
-            show_picture(axes, picture, LIGHT)
+            show_picture(axes, picture)
         column[0].set_title(f"{stop / 1000:.0f} ms", fontsize=8)
     names = [f"{kind} {angle}°" for kind in ("events", "intensity") for angle in POLARIZER_ANGLES_DEG]
     for axes, name in zip(grid[:, 0], [*names, "DoLP"], strict=True):

@@ -18,8 +18,7 @@ class Column:
     label: str
     decimals: int
     better: Literal["low", "high"]
-    ranked: bool = True
-    """Whether the best value is set in bold; costs are not ranked."""
+    ranked: bool = True  # whether the best value is set in bold; costs are not ranked
 
     @property
     def heading(self) -> str:
@@ -53,13 +52,6 @@ PARTS_AND_COSTS = {
 """Parts of the MSE (level, the squared error of the frame's mean, and pattern, the remainder), the mean squared offset
 of atanh(s1) and atanh(s2) and the MSE without it, and costs."""
 
-SET_TITLES = {
-    "simulated": "Simulated",
-    "measured": "Measured polarization",
-    "recordings": "Real targets",
-}
-"""Test sets, in the order of every page."""
-
 WINDOW_RULE = (
     "A window is the events between two frames of the truth, start included and end excluded; its truth is the frame "
     "at its end."
@@ -74,8 +66,7 @@ class Cell(NamedTuple):
     """One value of a table."""
 
     text: str
-    best: bool
-    """Whether no ranked row has a better value in this column; all ties are best."""
+    best: bool  # whether no ranked row has a better value in this column; all ties are best
 
 
 class Row(NamedTuple):
@@ -113,22 +104,16 @@ def score_table(
         columns = {**columns, "lpips": replace(columns["lpips"], label=f"LPIPS ({backbone})")}
     keys = [key for key in columns if any(row.get(key) is not None for row in scores.values())]
     methods = in_order(scores)
-    ranked = [method for method in methods if not is_rotating(method)]
-    best = {key: _best(columns[key], [scores[method].get(key) for method in ranked]) for key in keys}
-    rows = tuple(
-        Row(
-            method,
-            labels.get(method, method),
-            tuple(_cell(columns[key], key, scores[method], best[key] if method in ranked else None) for key in keys),
-        )
-        for method in methods
-    )
+    ranked = [not is_rotating(method) for method in methods]
+    cells = [_cells(columns[key], [scores[method].get(key) for method in methods], ranked) for key in keys]
+    by_row = zip(methods, zip(*cells, strict=True), strict=True)
+    rows = tuple(Row(method, labels.get(method, method), of_method) for method, of_method in by_row)
     notes = []
     if backbone and "lpips" in keys:
         notes.append(f"LPIPS ({backbone}): version 0.1 on the features of {LPIPS_BACKBONES[backbone]}.")
     if warmup_windows is not None:
         notes.append(f"{WINDOW_RULE} The first {warmup_windows} windows of each sequence count for no method.")
-    if len(ranked) < len(methods):
+    if not all(ranked):
         notes.append(ANOTHER_CAMERA)
     return Table(tuple(columns[key].heading for key in keys), rows, tuple(notes))
 
@@ -146,16 +131,9 @@ def as_plain(table: Table) -> str:
     return "\n".join([*(line.rstrip() for line in lines), *table.notes])
 
 
-def _best(column: Column, values: Sequence[float | int | None]) -> str | None:
-    """The best value as printed, so that rows with equal text are bold together."""
-    known = [value for value in values if value is not None]
-    if not column.ranked or not known:
-        return None
-    return column.printed(min(known) if column.better == "low" else max(known))
-
-
-def _cell(column: Column, key: str, scores: Mapping[str, Any], best: str | None) -> Cell:
-    if (value := scores.get(key)) is None:
-        return Cell("-", False)
-    text = column.printed(value)
-    return Cell(text, text == best)
+def _cells(column: Column, values: Sequence[float | int | None], ranked: Sequence[bool]) -> list[Cell]:
+    """A cell for each row; the best is found as printed, so that rows with equal text are bold together."""
+    texts = ["-" if value is None else column.printed(value) for value in values]
+    known = [value for value, counts in zip(values, ranked, strict=True) if counts and value is not None]
+    best = column.printed(min(known) if column.better == "low" else max(known)) if column.ranked and known else None
+    return [Cell(text, counts and text == best) for text, counts in zip(texts, ranked, strict=True)]

@@ -34,11 +34,9 @@ def films_of(path: Path, sequences: Sequence[str] = (), open_file: Open = open_r
     if is_recording(path):
         return [_events_film(path.name, open_plain(path, open_file).whole(), None)]
     stores = [path] if _is_store(path) else sorted(filter(_is_store, path.glob("*.zarr")))
-    if not stores:
-        raise FileNotFoundError(f"{path}: expected a folder that holds stores (*.zarr), found none")
     parts = [film for store in stores for film in _films(store, sequences)]
     if not parts:
-        raise FileNotFoundError(f"{path}: its stores hold no frame and no event")
+        raise FileNotFoundError(f"{path}: expected a folder with stores (*.zarr) of frames or events, found none")
     return _joined(parts)
 
 

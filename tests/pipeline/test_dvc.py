@@ -167,7 +167,7 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
         thorough("training/dolp.py", {"train"}),
         thorough("simulation/pixels/exact.py", (FROM_SIMULATION | ROWS) - {"ingest"}),
         thorough("metrics/similarity.py", {"report"} | TRAININGS | ROWS),
-        thorough("reports/charts.py", {"calibrate", "report"}),
+        thorough("reports/figures.py", {"calibrate", "report"}),
         thorough("benchmark/results.py", {"report"} | ROWS),
     ],
 )

@@ -2,8 +2,7 @@ import re
 
 import pytest
 
-from polarnet.reports.charts import error_chart, reliability_chart, sweep_chart
-from polarnet.reports.figures import svg
+from polarnet.reports.figures import error_chart, reliability_chart, svg, sweep_chart
 from polarnet.reports.legend import GENERAL, NETWORKS, glossary, legend_of
 from polarnet.reports.tables import COLUMNS, score_table
 
