@@ -14,8 +14,9 @@ from polarnet.runtime.sections import section
 
 Frames = Float[Tensor, "t b h w"]
 Maps = Float[Tensor, "t b *k h w"]
+TrueMaps = Float[Tensor, "t b *m h w"]  # may be more: `predicted` may be DoLP alone
 Valid = Bool[Tensor, "t b h w"] | None
-Term = Callable[[Maps, Maps, Valid], Float[Tensor, ""]]
+Term = Callable[[Maps, TrueMaps, Valid], Float[Tensor, ""]]
 
 
 @section
@@ -56,7 +57,7 @@ class Loss:
         self.weights = {name: weight for name, (weight, _) in terms.items() if weight}
         self._terms = {name: terms[name][1] for name in self.weights}
 
-    def __call__(self, predicted: Maps, truth: Maps, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
+    def __call__(self, predicted: Maps, truth: TrueMaps, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
         """Return the terms by name, before their weights; all are 0 if no frame has a valid pixel."""
         return {name: term(predicted, truth, valid) for name, term in self._terms.items()}
 
@@ -83,7 +84,7 @@ def frame_terms(
     if lpips is not None:
         scores["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
 
-    def term(name: str, predicted: Maps, truth: Maps, valid: Valid) -> Float[Tensor, ""]:
+    def term(name: str, predicted: Maps, truth: TrueMaps, valid: Valid) -> Float[Tensor, ""]:
         frames = (predicted, truth) if index is None else (predicted[:, :, index], truth[:, :, index])
         a, b, known = known_frames(*frames, valid)
         return scores[name](a, b, known).mean() if len(a) else 0 * predicted.sum()
@@ -97,7 +98,7 @@ def polarization_loss(config: LossConfig, lpips: Lpips | None, *, dolp_only: boo
     With `config.half_weight`, the terms `mse` and `stokes` are replaced by `relative_mse` and `relative_stokes`.
     """
 
-    def squared_errors(maps: slice, predicted: Maps, truth: Maps, valid: Valid) -> Float[Tensor, ""]:
+    def squared_errors(maps: slice, predicted: Maps, truth: TrueMaps, valid: Valid) -> Float[Tensor, ""]:
         errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
         errors = errors * frame_weights(truth[:, :, 0], valid, config.half_weight)[..., None, None]
         if valid is None:
