@@ -5,7 +5,6 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,6 +115,6 @@ def cost_of(row: str, sequence: TestSequence, context: Context) -> Cost:
 
 def first_windows(sequence: TestSequence, count: int) -> TestSequence:
     """The first `count` windows of a sequence; all of it if it is shorter. Later events belong to no window."""
-    maps = {name: getattr(sequence, name) for name in ("dolp", "aolp", "s0", "valid")}
-    shorter: dict[str, Any] = {name: None if frames is None else frames[:count] for name, frames in maps.items()}
-    return replace(sequence, t_us=sequence.t_us[: count + 1], **shorter)
+    frames = {name: getattr(sequence, name)[:count] for name in ("dolp", "aolp", "s0")}
+    valid = None if sequence.valid is None else sequence.valid[:count]
+    return replace(sequence, t_us=sequence.t_us[: count + 1], valid=valid, **frames)

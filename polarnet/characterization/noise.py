@@ -49,9 +49,9 @@ def hot_under_constant_light(events: Events) -> Bool[np.ndarray, " pixels"]:
 
 
 def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"], pixel: PixelConfig) -> Noise:
-    """Noise from a recording of constant light, with its hot pixels; ValueError with fewer than 100 events.
+    """Noise from a recording of constant light, with its hot pixels.
 
-    Spread and jitter of the leak are those of `pixel`.
+    Spread and jitter of the leak are those of `pixel`. ValueError with fewer than 100 events, or if all pixels are hot.
     """
     if len(events.t_us) < 100:
         raise ValueError(
@@ -59,6 +59,8 @@ def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"], pixel:
         )
     counts = np.bincount(events.pixel, minlength=events.pixels)
     good = int((~hot).sum())
+    if not good:
+        raise ValueError(f"expected pixels that are not hot, got {len(hot)} hot ones; record a uniform, constant light")
     duration_s = float(np.ptp(events.t_us)) * 1e-6
     exposure_s = good * duration_s
     ordinary = chosen_pixels(events, ~hot)
@@ -84,7 +86,7 @@ def estimate_noise(events: PixelEvents, hot: Bool[np.ndarray, " pixels"], pixel:
 
 
 def leak_of(leaks_hz: float, shot_hz: float, pixel: PixelConfig) -> float:
-    """Median leak rate of pixels that leak `leaks_hz` times a second on average between `shot_hz` events of shot noise.
+    """Median leak rate (Hz) of pixels that leak `leaks_hz` > 0 times a second between `shot_hz` events of shot noise.
 
     A pixel leaks after an event with the probability q = <exp(-shot_hz T)> that no shot noise comes before T. Its leaks
     are then shot_hz q / (1 - q) a second.

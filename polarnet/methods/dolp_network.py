@@ -48,8 +48,8 @@ def dolp_recoverer(
     """Wrap a network and the metadata of its checkpoint (`load_network`) as a method for windows of any length.
 
     `precision` is fp32 or bf16 (autocast). `thresholds` (ON, OFF) replace the network's own estimate, and `binning`
-    the side of the pixel blocks that it sees. ValueError for another network than polarnet's, which alone has these
-    options, or a value out of range.
+    the side of the pixel blocks that it sees. The network itself moves to `device` and keeps these options. ValueError
+    if one is given for another network than polarnet's, which alone has them, or is out of range.
     """
     place = torch.device(device)
     ready: Any = network.to(place, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
@@ -77,7 +77,7 @@ def dolp_recoverer(
 
     def at_once(height: int, width: int) -> int:
         side = getattr(ready, "binning", 1)
-        return windows_at_once(height // side, width // side)
+        return windows_at_once(max(1, height // side), max(1, width // side))
 
     recoverer = network_recoverer(ready, place, precision, encoded, of_stream)._replace(at_once=at_once)
     trained_us = trained_window_us(metadata)

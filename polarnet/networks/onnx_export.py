@@ -1,6 +1,6 @@
 """Export of a DoLP network to ONNX: one window of one stream, with the state as named inputs and outputs.
 
-The metadata of the file describes its inputs and outputs as JSON, so ONNX Runtime can run it without polarnet.
+The metadata of the file describes its inputs and outputs as JSON, so a program can run it with ONNX Runtime alone.
 """
 
 import importlib.util
@@ -62,8 +62,9 @@ def export_network(
 ) -> None:
     """Write the result of `load_network` to `path` (.onnx) for one image size, once it passes `check_program`.
 
-    The file contains the weights, and the same network gives the same bytes. ValueError or FileNotFoundError if `path`
-    cannot be written, RuntimeError if packages are missing or the check fails; an existing file is then unchanged.
+    The file contains the weights, and the same network gives the same bytes. ValueError for a size below one pixel or
+    another suffix, FileNotFoundError without the folder of `path`, RuntimeError if packages are missing or the check
+    fails; an existing file is then unchanged.
     """
     for name in ("onnx", "onnxruntime", "onnxscript"):
         if importlib.util.find_spec(name) is None:

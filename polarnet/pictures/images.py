@@ -42,7 +42,7 @@ class UnreadablePicture(ValueError):
 class Picture:
     """A picture in the encoding of its file, turned upright."""
 
-    pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; float: 1.0 is white
+    pixels: Shaped[np.ndarray, "h w 3"]  # uint8, uint16 or float32; white is 1.0 in float32 unless `light`
     profile: bytes | None  # embedded ICC profile
     colour_space: str  # OpenImageIO's name of the encoding; means nothing beside a profile
     light: bool  # whether the pixels are linear light in floating-point numbers, as in OpenEXR and Radiance HDR files
@@ -76,8 +76,9 @@ def picture_extensions() -> frozenset[str]:
 def read_picture(path: str | os.PathLike[str], grey: bool = False) -> Picture:
     """Read the first picture of a file, without alpha and turned upright by its EXIF orientation.
 
-    With `grey`, one channel is read as three equal ones in sRGB. UnreadablePicture with the reason: no picture,
-    damaged, cut off, camera raw, more than MAX_PIXELS, fewer than three channels, or values that are not finite.
+    With `grey`, one channel is read as three equal ones, in sRGB unless `light`. UnreadablePicture with the reason,
+    such as no picture, damaged, cut off, camera raw, more than MAX_PIXELS, fewer than three channels, a damaged
+    profile, or values that are not finite.
     """
     pixels, spec, file_format = _read(Path(path))
     light = _is_light(spec, file_format)
@@ -98,7 +99,10 @@ def read_picture(path: str | os.PathLike[str], grey: bool = False) -> Picture:
 
 
 def read_channels(path: str | os.PathLike[str]) -> Shaped[np.ndarray, "h w c"]:
-    """Code values of all channels except alpha, not turned by an orientation; raises as `read_picture` does."""
+    """Code values of all channels except alpha, not turned by an orientation.
+
+    UnreadablePicture as `read_picture`, but any number of channels will do.
+    """
     pixels, spec, _ = _read(Path(path), as_stored=True)
     return pixels[..., [i for i in range(spec.nchannels) if i != spec.alpha_channel]]
 
@@ -239,7 +243,7 @@ def light_of(pixels: Float32[np.ndarray, "h w 3"], white: float | None = None) -
 
 
 def _read(path: Path, as_stored: bool = False) -> tuple[Shaped[np.ndarray, "h w c"], Any, str]:
-    """Upright pixels of all channels, OpenImageIO's description of them, and the name of the format."""
+    """Pixels of all channels, upright unless `as_stored`; OpenImageIO's description; the name of the format."""
     kind = extension(path)
     if kind in CAMERA_RAW:
         raise UnreadablePicture("camera raw: only a preview in it can be read; develop it to 16-bit TIFF first")

@@ -65,7 +65,7 @@ class Pose(NamedTuple):
     x: Float64[np.ndarray, "*n"]  # scene column under the sensor's centre
     y: Float64[np.ndarray, "*n"]  # scene row
     angle: Float64[np.ndarray, "*n"]  # radians by which the camera is rolled clockwise; the picture turns the other way
-    zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1
+    zoom: Float64[np.ndarray, "*n"]  # sensor pixels per scene pixel, >= 1 in a `Trajectory`
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Trajectory:
     y_sines: tuple[Sine, ...]
     roll: Sine  # radians
     zoom: Sine  # added to 1 + its amplitude, so that the zoom is at least 1
-    speed_px_s: float  # maximum over all sensor pixels and times; reached once where roll and zoom are 0
+    speed_px_s: float  # upper bound over all sensor pixels and times, reached without roll and zoom
 
     def pose(self, t_s: Float64[np.ndarray, "*n"]) -> Pose:
         """Pose at times in seconds from the start of the sequence."""
@@ -128,8 +128,8 @@ def random_trajectory(
     """A smooth motion of a sensor inside a scene.
 
     The velocity along each axis is a sum of harmonics, the slowest of which turns the sensor back before the border.
-    The peak speed is drawn between the configured bounds and reached at a random time. ValueError if the scene is too
-    small for the sensor or for its slowest motion.
+    The peak speed is drawn between the configured bounds, lowered where the scene or the acceleration limit demands it,
+    and reached at a random time. ValueError if the scene is too small for the sensor or for its slowest motion.
 
     >>> import numpy as np
     >>> from polarnet.simulation import MOTIONS, random_trajectory
@@ -301,7 +301,10 @@ def sensor_to_scene(x, y, angle, zoom, height, width):
 
 @inlined
 def _bilinear(image, x, y):
-    """Value of an image between the four pixels around (x, y); exact at integers, clamped at the border."""
+    """Value of an image between the four pixels around (x, y); exact at integers.
+
+    Outside the image it is extrapolated from the nearest four.
+    """
     column = min(max(int(x), 0), image.shape[1] - 2)
     row = min(max(int(y), 0), image.shape[0] - 2)
     right, down = np.float32(x - column), np.float32(y - row)

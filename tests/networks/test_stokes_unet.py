@@ -110,5 +110,5 @@ def test_the_panorama_is_averaged_in_where_the_scene_moves():
 def test_settings_that_make_no_network_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         replace(CONFIG, **changes)
-    with pytest.raises(ValueError, match=r"takes 8 images \(representation event_counts\), got 4"):
+    with pytest.raises(ValueError, match="expected 8 images a window, got 4"):
         StokesUNet(CONFIG, 4)

@@ -86,7 +86,7 @@ def test_frames_of_a_davis_are_differences_of_two_samples_and_need_all_of_them(t
     path.write_bytes(path.read_bytes()[:-8])
     assert aedat2_frames(path).t_us.tolist() == [5000]
     write_aedat2(path, events, NO_TIMES, NO_FRAMES)
-    with pytest.raises(RecordingError, match="expected frames of the DAVIS as true polarization, there are none"):
+    with pytest.raises(RecordingError, match="expected frames of the DAVIS as true polarization, got no whole one"):
         aedat2_frames(path)
 
 

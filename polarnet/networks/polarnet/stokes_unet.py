@@ -25,7 +25,7 @@ IMAGES = 2  # input images per channel: sum of polarities and number of events (
 PARTS = ("redundancy", "slopes", "shot_noise", "sums", "recurrence", "panorama", "sensitivity", "scale")
 MIDDLE_DOLP = 0.3  # initial DoLP of the constant candidate
 NOISE_TENSORS = SENSITIVITY_TENSORS = 2  # of the state, see `StokesUNet`
-NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments or wide sums, and no more
+NO_STATE: list[Any] = [None] * (2 + len(WIDE))  # before the first window: no sums, moments, wide sums or panorama
 SOLVER_TENSORS = NOISE_TENSORS + SENSITIVITY_TENSORS + len(NO_STATE) + 1 + len(Panorama._fields)
 MAX_BINNING = 8
 Binning = Annotated[int, Field(ge=1, le=MAX_BINNING)]
@@ -38,8 +38,8 @@ class StokesUNetConfig:
     """Section `networks.polarnet` of params.yaml."""
 
     binning: Binning
-    """Side in pixels of the blocks whose events are averaged before anything else. Time falls with its square; the
-    outputs are interpolated back to the sensor's size."""
+    """Side in pixels of the blocks whose events are averaged before anything else. Computing time falls with its
+    square; the outputs are interpolated back to the sensor's size."""
     channels: Few[Annotated[int, Field(gt=0, le=1024)]]
     """Channels at 1/2, 1/4, 1/8, ... of the resolution; at least three numbers."""
     memories: Few[Annotated[float, Field(ge=0, le=0.999)]]
@@ -88,7 +88,8 @@ class StokesUNetConfig:
 
 
 class Candidates(NamedTuple):
-    """Least-squares solutions at quarter resolution: one per memory, decay and scale, and one per panorama scale."""
+    """Least-squares solutions at quarter resolution: of events, one per memory, decay and scale; then of the panorama,
+    one per scale."""
 
     s1: Float[Tensor, "n c h w"]
     s2: Float[Tensor, "n c h w"]
@@ -108,7 +109,7 @@ class Solved(NamedTuple):
     scale: Float[Tensor, "n 1 1 1"]
     """Factor of the sums: `Scale`."""
     images: Float[Tensor, "n 4 h/2 w/2"]
-    """The panorama's four images."""
+    """The panorama's four images, in steps of `panorama_step`."""
     certain: Float[Tensor, "n 1 1 1"]
     """The panorama's certainty."""
     noise: Counts
@@ -134,7 +135,7 @@ class StokesUNet(nn.Module):
     and the states of the recurrent layers.
 
     DoLP is predicted separately from the length of (s1, s2). Where (s1, s2) are uncertain, their mean is too short,
-    like any mean over angles. The outputs are linear, as in the paper's network.
+    like any mean over angles. No activation bounds the outputs, as in the paper's network.
     """
 
     representation = "event_counts"
@@ -147,7 +148,7 @@ class StokesUNet(nn.Module):
     def __init__(self, config: StokesUNetConfig, in_channels: int = 4 * IMAGES):
         super().__init__()
         if in_channels != 4 * IMAGES:
-            raise ValueError(f"network=polarnet takes 8 images (representation event_counts), got {in_channels}")
+            raise ValueError(f"network=polarnet: expected 8 images a window, got {in_channels}; use event_counts")
         self.binning, self.scales = config.binning, config.scales
         self.register_buffer("memories", torch.tensor(config.memories), persistent=False)
         self.register_buffer("decays", torch.tensor(config.decays), persistent=False)

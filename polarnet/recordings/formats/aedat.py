@@ -58,7 +58,7 @@ def open_aedat2(path: Path, choices: Choices) -> Source:
 
 
 def aedat2_frames(path: Path) -> CameraFrames:
-    """Frames of a DAVIS: 10-bit light of every pixel, and the mean over the pixels of the middle of their exposure.
+    """Frames of a DAVIS: 10-bit light of every pixel. Times (us) are the middle of the exposure, averaged over pixels.
 
     A frame that lacks samples, such as the last one of a file, is left out. RecordingError if none is complete.
     """
@@ -83,7 +83,9 @@ def aedat2_frames(path: Path) -> CameraFrames:
                 frames.append(light.astype(np.uint16))
                 light[:] = -1
     if not frames:
-        raise RecordingError(f"{path.name}: expected frames of the DAVIS as true polarization, there are none")
+        raise RecordingError(
+            f"{path.name}: expected frames of the DAVIS as true polarization, got no whole one; record frames too"
+        )
     return CameraFrames(np.array(times), np.stack(frames).reshape(-1, height, width))
 
 

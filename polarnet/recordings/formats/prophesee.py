@@ -72,7 +72,7 @@ def open_evt(path: Path, choices: Choices) -> Source:
 
 
 def evt_block(version: str, words: np.ndarray, state: Int64[np.ndarray, " 6"], counts: Counts) -> Block:
-    """Events of the next words of a key of `EVT`; `state`, first `EVT_START`, is updated.
+    """Decode the next words of a format, a key of `EVT`; `state`, first `EVT_START`, is updated.
 
     Events before the first time or row are counted as `orphans`.
     """
@@ -84,7 +84,7 @@ def evt_block(version: str, words: np.ndarray, state: Int64[np.ndarray, " 6"], c
 
 
 def open_dat(path: Path, choices: Choices) -> Source:
-    """Open change detection events of version 1 or 2; in version 2, times that wrap after 71 minutes are unwrapped."""
+    """Open change detection events of version 1 or 2; times that wrap after 71 minutes are unwrapped."""
     header, after, _ = header_lines(path, PREFIX, LAST_LINE, MAX_HEADER_BYTES)
     if len(after) < 2 or after == PREFIX:
         raise RecordingError(f"{path.name}: the file ends within its header of % lines")
@@ -143,7 +143,7 @@ def _decode_evt2(words: np.ndarray, *state_and_columns: np.ndarray) -> tuple[int
 
 @compiled
 def _decode_evt21(words, state, t, x, y, p):
-    """Decode words of 64 bits by their upper 4 bits: 0 OFF, 1 ON, 32 pixels from x on, 8 the time's upper bits."""
+    """Decode words of 64 bits by their upper 4 bits: 0 OFF, 1 ON, with a mask of 32 pixels from x on; 8 upper time."""
     high, turns = state[0], state[1]
     n, orphans = 0, 0
     for i in range(len(words)):

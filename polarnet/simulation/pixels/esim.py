@@ -1,7 +1,7 @@
 """The pixel model `esim` (Rebecq et al., CoRL 2018): log intensity is linear in time between frames.
 
 As in the published code for a CPU, log intensity and reference are float32, and levels are looked for between the
-values of two frames. The model has no noise, mismatch or low-pass.
+values of two frames. The model has a refractory period, but no noise, mismatch or low-pass.
 """
 
 import math
@@ -15,7 +15,7 @@ from polarnet.simulation.pixels.light import FULL_SCALE, Light, intensity_rows, 
 
 EIGHT_BIT_VIDEO = False
 NO_CHANGE = 1e-6  # log intensity; smaller changes are ignored
-NEARLY = np.float32(0.99999)  # lowers thresholds by more than rounding in a first test
+NEARLY = np.float32(0.99999)  # factor on thresholds in a quick first test, so that rounding hides no crossing
 
 
 class Pixels(NamedTuple):
@@ -27,7 +27,7 @@ class Pixels(NamedTuple):
 
 
 def start(light: Light, steps: Steps) -> Pixels:
-    """Pixels whose reference is the first frame; nothing has fired."""
+    """Pixels whose reference is the log intensity of the first frame; nothing has fired."""
     n = steps.height * steps.width
     dn, logarithm = np.empty((2, n), np.float32)
     _respond(light, ZERO, steps, _table(steps.physics), dn, logarithm)
