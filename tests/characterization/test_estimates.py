@@ -45,6 +45,8 @@ def test_a_slow_pixel_is_hot_above_ten_times_its_neighbours_events_and_too_few_a
     assert np.flatnonzero(hot_under_constant_light(events_of(sorted(rows), 8, 8))).tolist() == [8 * 4 + 3]
     with pytest.raises(ValueError, match="record for longer"):
         estimate_noise(recorded([np.arange(5.0)], [np.ones(5, bool)]), NO_HOT[:1], SENSORS["default"])
+    with pytest.raises(ValueError, match="expected pixels that are not hot, got 1 hot ones"):
+        estimate_noise(recorded([np.arange(200.0)], [np.ones(200, bool)]), ~NO_HOT[:1], SENSORS["default"])
 
 
 def test_the_rate_of_a_poisson_process_does_not_swing_and_that_of_a_passing_edge_does():

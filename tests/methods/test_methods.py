@@ -174,6 +174,7 @@ def test_a_network_that_is_told_thresholds_or_blocks_of_pixels_uses_them(sequenc
     coarse.load_state_dict(stokes_unet.state_dict())
     stokes_unet.scale.given = None
     told_at_use = recovered(dolp_recoverer(stokes_unet, COUNTS, binning=2), sequence.windows())
+    assert dolp_recoverer(stokes_unet, COUNTS, binning=2).at_once(1, 1) >= 1  # a sensor smaller than a block
     assert torch.equal(told_at_use.dolp, recovered(dolp_recoverer(coarse, COUNTS), sequence.windows()).dolp)
 
 
