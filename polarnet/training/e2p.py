@@ -50,17 +50,13 @@ def e2p_task(config: E2pConfig, lpips: Lpips | None, seed: int) -> Task:
 
     polarization = {"lpips": config.lpips, "mse": config.mse, "ssim_loss": config.ssim}
     weights = {"intensity": {"lpips": config.intensity_lpips}, "aolp": polarization, "dolp": polarization}
-    terms = {
-        f"{branch}_{name}": term
-        for index, branch in enumerate(BRANCHES)
-        for name, term in frame_terms(weights[branch], lpips, index).items()
-    }
+    branches = [frame_terms(weights[branch], lpips, i, f"{branch}_") for i, branch in enumerate(BRANCHES)]
     return Task(
         network=network,
         encode=encode,
         streams=streams,
         unroll=network.unroll,
-        loss=Loss(terms),
+        loss=Loss(*branches),
         description={
             "network": "e2p",
             "config": {"bins": config.bins},

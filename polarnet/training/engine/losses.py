@@ -1,7 +1,6 @@
 """Training losses (paper Eq. 6-9)."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,7 +15,8 @@ Frames = Float[Tensor, "t b h w"]
 Maps = Float[Tensor, "t b *k h w"]
 TrueMaps = Float[Tensor, "t b *m h w"]  # may be more: `predicted` may be DoLP alone
 Valid = Bool[Tensor, "t b h w"] | None
-Term = Callable[[Maps, TrueMaps, Valid], Float[Tensor, ""]]
+Terms = tuple[Mapping[str, float], Callable[[Maps, TrueMaps, Valid], Mapping[str, Tensor]]]
+"""Weights of some terms by name, and the function that computes those terms together."""
 
 
 @section
@@ -53,26 +53,25 @@ def known_frames(predicted: Frames, truth: Frames, valid: Valid) -> tuple[Tensor
 class Loss:
     """A weighted sum of terms by name, without those of weight 0."""
 
-    def __init__(self, terms: Mapping[str, tuple[float, Term]]):
-        self.weights = {name: weight for name, (weight, _) in terms.items() if weight}
-        self._terms = {name: terms[name][1] for name in self.weights}
+    def __init__(self, *groups: Terms):
+        self.weights = {name: weight for weights, _ in groups for name, weight in weights.items() if weight}
+        self._values = [values for weights, values in groups if any(weights.values())]
 
     def __call__(self, predicted: Maps, truth: TrueMaps, valid: Valid = None) -> dict[str, Float[Tensor, ""]]:
         """Return the terms by name, before their weights; all are 0 if no frame has a valid pixel."""
-        return {name: term(predicted, truth, valid) for name, term in self._terms.items()}
+        return {name: term for values in self._values for name, term in values(predicted, truth, valid).items()}
 
     def total(self, terms: Mapping[str, Float[Tensor, ""]]) -> Float[Tensor, ""]:
         """Return the weighted sum of the terms."""
         return torch.stack([self.weights[name] * term for name, term in terms.items()]).sum()
 
 
-def frame_terms(
-    weights: Mapping[str, float], lpips: Lpips | None, index: int | None = None
-) -> dict[str, tuple[float, Term]]:
+def frame_terms(weights: Mapping[str, float], lpips: Lpips | None, index: int | None = None, prefix: str = "") -> Terms:
     """Terms mse, mae, ssim_loss (1 - SSIM, Eq. 7) and lpips of the map `index`, each a mean over all frames.
 
-    `index` is None for frames without an axis of maps. Invalid pixels (see `polarnet.metrics.similarity`) and frames
-    without a valid pixel count in no term. ValueError if LPIPS has a weight but `lpips` is None.
+    `index` is None for frames without an axis of maps; `prefix` begins the names. Invalid pixels (see
+    `polarnet.metrics.similarity`) and frames without a valid pixel count in no term. ValueError if LPIPS has a weight
+    but `lpips` is None.
     """
     if lpips is None and weights.get("lpips", 0) > 0:
         raise ValueError(f"lpips: its weight is {weights['lpips']}, but there is no LPIPS network; load one")
@@ -83,13 +82,14 @@ def frame_terms(
     }
     if lpips is not None:
         scores["lpips"] = lambda a, b, valid: lpips(with_truth_outside(a, b, valid), b)
+    used = [name for name, weight in weights.items() if weight]
 
-    def term(name: str, predicted: Maps, truth: TrueMaps, valid: Valid) -> Float[Tensor, ""]:
+    def values(predicted: Maps, truth: TrueMaps, valid: Valid) -> dict[str, Tensor]:
         frames = (predicted, truth) if index is None else (predicted[:, :, index], truth[:, :, index])
         a, b, known = known_frames(*frames, valid)
-        return scores[name](a, b, known).mean() if len(a) else 0 * predicted.sum()
+        return {prefix + name: scores[name](a, b, known).mean() if len(a) else 0 * predicted.sum() for name in used}
 
-    return {name: (weight, partial(term, name)) for name, weight in weights.items() if name in scores}
+    return {prefix + name: weights[name] for name in used}, values
 
 
 def polarization_loss(config: LossConfig, lpips: Lpips | None, *, dolp_only: bool) -> Loss:
@@ -98,20 +98,25 @@ def polarization_loss(config: LossConfig, lpips: Lpips | None, *, dolp_only: boo
     With `config.half_weight`, the terms `mse` and `stokes` are replaced by `relative_mse` and `relative_stokes`.
     """
 
-    def squared_errors(maps: slice, predicted: Maps, truth: TrueMaps, valid: Valid) -> Float[Tensor, ""]:
-        errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
-        errors = errors * frame_weights(truth[:, :, 0], valid, config.half_weight)[..., None, None]
-        if valid is None:
-            return errors.flatten().mean()
-        return errors[valid].mean() if valid.any() else 0 * errors.sum()
+    def squared_errors(name: str, weight: float, maps: slice) -> Terms:
+        def values(predicted: Maps, truth: TrueMaps, valid: Valid) -> dict[str, Tensor]:
+            errors = (predicted[:, :, maps] - truth[:, :, maps]).square().sum(2)
+            errors = errors * frame_weights(truth[:, :, 0], valid, config.half_weight)[..., None, None]
+            if valid is None:
+                return {name: errors.flatten().mean()}
+            return {name: errors[valid].mean() if valid.any() else 0 * errors.sum()}
 
-    terms = frame_terms({"mse": config.mse, "ssim_loss": config.ssim, "lpips": config.lpips}, lpips, index=0)
-    stokes = (0.0 if dolp_only else config.stokes, partial(squared_errors, slice(1, None)))
+        return {name: weight}, values
+
+    similarity, stokes = {"ssim_loss": config.ssim, "lpips": config.lpips}, 0.0 if dolp_only else config.stokes
     if config.half_weight is None:
-        return Loss(terms | {"stokes": stokes})
-    del terms["mse"]
-    relative_mse = (config.mse, partial(squared_errors, slice(0, 1)))
-    return Loss({"relative_mse": relative_mse} | terms | {"relative_stokes": stokes})
+        frames = frame_terms({"mse": config.mse} | similarity, lpips, index=0)
+        return Loss(frames, squared_errors("stokes", stokes, slice(1, None)))
+    return Loss(
+        squared_errors("relative_mse", config.mse, slice(0, 1)),
+        frame_terms(similarity, lpips, index=0),
+        squared_errors("relative_stokes", stokes, slice(1, None)),
+    )
 
 
 def frame_weights(dolp: Frames, valid: Valid, half_weight: float | None) -> Float[Tensor, "t b"]:
