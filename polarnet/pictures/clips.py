@@ -3,7 +3,6 @@
 import itertools
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -111,8 +110,7 @@ def _open_files(groups: Sequence[tuple[Path, ...]], name: str, options: ClipOpti
     else:
         words = _coloured_words("photograph" if still else "frames", options)
         read = partial(_rgb, white=None if still else 1.0)
-        with suppress(UnreadablePicture):  # raised again with the first frame
-            light = images.read_picture(groups[0][0], grey=True).light
+        light = images.holds_light(groups[0][0])
     return Clip(name, words, measured, len(groups), still, light, options, partial(_from_files, groups, read))
 
 

@@ -230,6 +230,20 @@ def read_light(path: str | os.PathLike[str]) -> Float32[Tensor, "3 h w"]:
     return torch.from_numpy(np.ascontiguousarray(light_of(picture.pixels).transpose(2, 0, 1)))
 
 
+def holds_light(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds linear light in floating-point numbers, as OpenEXR and Radiance HDR files do.
+
+    Only its header is read; False for a file that cannot be opened.
+    """
+    try:
+        file = _opened(Path(path))
+    except UnreadablePicture:
+        return False
+    spec, file_format = file.spec(), file.format_name()
+    file.close()
+    return _is_light(spec, file_format)
+
+
 def light_of(pixels: Float32[np.ndarray, "h w 3"], white: float | None = None) -> Float32[np.ndarray, "h w 3"]:
     """Pixels of linear light as shares of `white`, clipped to [0, 1]; None: of their brightest value.
 
