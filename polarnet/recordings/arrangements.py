@@ -49,6 +49,8 @@ class Input(NamedTuple):
     """Whether each frame is wanted as soon as its last event has arrived; otherwise windows are predicted together."""
     waits: bool = True
     """Whether the source waits until it is read. Windows of a live one that does not are joined if need be."""
+    unread: Callable[[], bool] = lambda: False
+    """Whether more has arrived from a live source than `pieces` have given."""
 
     def shares_read(self) -> dict[str, str]:
         """The part of the files that is read, in words; empty where their formats do not tell."""
@@ -96,6 +98,7 @@ def pieces_of(blocks: Iterable[tuple[Sequence[Events], float]], origin_us: int |
         if filled:
             origin_us = min(int(t[0]) for t in filled) if origin_us is None else origin_us
             until_us = max(until_us, *(int(t[-1]) - origin_us for t in filled))
+        if origin_us is not None:
             yield Piece([shifted(events, origin_us) for events in channels], until_us, read_at)
 
 

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from queue import Empty, Queue
 from threading import Thread
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -32,17 +32,20 @@ from polarnet.recordings.source import SAFE, Block, Counts, RecordingError
 from polarnet.stokes import POLARIZER_ANGLES_DEG, Mosaic
 from polarnet.terminal.installation import installation
 
-READ_BYTES = 2**18
+READ_BYTES = 2**20  # of one piece at most
 PIPE_BYTES = 2**16  # capacity of a pipe, which bounds what one read returns
 MAX_READ_AHEAD = 2**26  # bytes that wait to be parsed; if there are more, the program at the other end has to wait
+MAX_BATCHES = 512  # of a camera, that wait to be read
 POLL_S = 0.001
 MAX_WAIT_S = 0.02  # events whose times later ones must confirm wait no longer, unless later ones have arrived
 SCHEME, CAMERA = "dv://", "camera"
 NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")
 
 Table: TypeAlias = Int64[np.ndarray, "n columns"]
-Lines: TypeAlias = Iterator[tuple[bytes, float]]
-Arrivals: TypeAlias = Queue[tuple[bytes, float] | None]
+Lines: TypeAlias = Iterator[tuple[bytes | None, float]]
+Data = TypeVar("Data")
+Arrivals: TypeAlias = Queue[tuple[Data, float] | Exception | None]
+"""Data and their times of arrival, then None, or the exception that ended them."""
 
 
 class _Stream:
@@ -58,11 +61,14 @@ class _Stream:
         """Seconds until the events that are held back are to be flushed; None if there are none."""
         return max(0.0, self._since + MAX_WAIT_S - time.perf_counter()) if self._clock.waiting else None
 
-    def input(self, tables: Iterable[tuple[Table | None, float]], *, waits: bool) -> Input:
+    def input(self, tables: Iterable[tuple[Table | None, float]], queue: Arrivals, *, waits: bool) -> Input:
         """Tables and their times of arrival as an input; None where events were held back for long enough."""
         height, width = (side // 2 if self._mosaic else side for side in self._sensor)
         blocks = itertools.chain.from_iterable(self._add(*one) for one in itertools.chain(tables, [(None, 0.0)]))
-        return Input(self.name, height, width, pieces_of(blocks), [(self.name, self.counts)], live=True, waits=waits)
+        pieces, repairs = pieces_of(blocks), [(self.name, self.counts)]
+        return Input(
+            self.name, height, width, pieces, repairs, live=True, waits=waits, unread=lambda: not queue.empty()
+        )
 
     def _add(self, table: Table | None, read_at: float) -> Iterator[tuple[list[Events], float]]:
         """Channels of the next rows `t x y p` or `t x y p angle`, and the time of arrival of the first of them."""
@@ -76,16 +82,19 @@ class _Stream:
             self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
             good &= known
             p *= 1 + channel  # the clock sorts the columns of `Block` alone, so p holds the channel too
-        x, y, p = (column[good].astype(dtype) for column, dtype in ((x, np.int16), (y, np.int16), (p, np.int8)))
-        for ready in self._clock.ordered(Block(t[good], x, y, p), final=table is None):
-            if len(ready.t):
-                yield self._channels(ready), self._since
+        block = Block(t, x.astype(np.int16), y.astype(np.int16), p.astype(np.int8))
+        block = block if good.all() else block.rows(good)
+        for ready in self._clock.ordered(block, final=table is None):
+            yield self._channels(ready), self._since
 
     def _channels(self, block: Block) -> list[Events]:
         if self._mosaic:
             return split_mosaic(self._events(block), self._mosaic)
         channel = np.abs(block.p)
-        return [self._events(block.rows(channel == 1 + k)) for k in range(len(POLARIZER_ANGLES_DEG))]
+        order, numbers = np.argsort(channel, kind="stable"), np.arange(1, len(POLARIZER_ANGLES_DEG))
+        sorted_rows = block.rows(order)
+        ends = [0, *np.searchsorted(channel[order], numbers, side="right"), len(channel)]
+        return [self._events(sorted_rows.rows(slice(*of_channel))) for of_channel in itertools.pairwise(ends)]
 
     def _events(self, block: Block) -> Events:
         t, x, y, p = map(torch.from_numpy, block)
@@ -99,7 +108,7 @@ def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
     (and 8) are unusable for the same reason, or where the first line is not a size.
     """
     waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-    queue: Arrivals = Queue(MAX_READ_AHEAD // (READ_BYTES if waits else PIPE_BYTES))
+    queue: Arrivals[bytes] = Queue(MAX_READ_AHEAD // (READ_BYTES if waits else PIPE_BYTES))
     own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
     Thread(target=_read, args=[source, own, queue], daemon=True).start()
     stream: _Stream | None = None
@@ -109,20 +118,23 @@ def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
     def tables() -> Iterator[tuple[Table | None, float]]:
         shift, number = np.zeros(4 if mosaic else 5, np.int64), 0
         for data, read_at in lines:
+            if data is None:
+                yield None, read_at
+                continue
             number += data.count(b"\n")
             rows = [np.empty((0, len(shift)), np.int64), *rows_of(data, shift, stream.counts, "unreadable_lines")]
-            yield np.concatenate(rows) if data else None, read_at
+            yield np.concatenate(rows), read_at
             refuse_much_damage(name, stream.counts, number, (*SAFE, "time_glitches"))
 
-    return stream.input(tables(), waits=waits)
+    return stream.input(tables(), queue, waits=waits)
 
 
 def _size(name: str, lines: Lines) -> tuple[list[int], Lines]:
     """Width and height in the first line that is no comment, and the lines after it."""
     line = b""
     while not line.partition(b"#")[0].strip():
-        data, read_at = next(lines, (b"", 0.0))
-        if not data:
+        data, read_at = next(lines, (None, 0.0))
+        if data is None:
             break
         line, _, rest = data.partition(b"\n")
         lines = itertools.chain([(rest, read_at)] if rest else [], lines)
@@ -132,34 +144,46 @@ def _size(name: str, lines: Lines) -> tuple[list[int], Lines]:
     return [*map(int, words)], lines
 
 
-def _whole_lines(queue: Arrivals, patience_s: Callable[[], float | None]) -> Lines:
-    """Complete lines with their time of arrival, none where events were held back for long enough.
-
-    At the end of the input, also an incomplete last line.
-    """
-    rest, read_at = b"", 0.0
+def _arrived(queue: Arrivals[Data], patience_s: Callable[[], float | None]) -> Iterator[tuple[Data | None, float]]:
+    """The data of a queue with their times of arrival, None where events were held back for long enough."""
     while True:
         try:
             arrived = queue.get(timeout=patience_s())
         except Empty:
-            yield b"", time.perf_counter()
+            yield None, time.perf_counter()
             continue
         if arrived is None:
-            break
-        data, read_at = arrived
-        while len(data) < READ_BYTES and not queue.empty():  # data already waiting joins this piece
-            if (more := queue.get()) is None:
-                queue.put(None)
+            return
+        if isinstance(arrived, Exception):
+            raise arrived
+        yield arrived
+
+
+def _whole_lines(queue: Arrivals[bytes], patience_s: Callable[[], float | None]) -> Lines:
+    """Complete lines with their time of arrival, none where none is complete yet; None as in `_arrived`.
+
+    At the end of the input, also an incomplete last line.
+    """
+    rest, read_at = b"", 0.0
+    for data, read_at in _arrived(queue, patience_s):
+        if data is None:
+            yield None, read_at
+            continue
+        parts, size = [rest, data], len(data)
+        while size < READ_BYTES and not queue.empty():  # data already waiting joins this piece
+            more = queue.get()
+            if not isinstance(more, tuple):
+                queue.put(more)
                 break
-            data += more[0]
-        lines, end, rest = (rest + data).rpartition(b"\n")
-        if end:
-            yield lines + end, read_at
+            parts.append(more[0])
+            size += len(more[0])
+        lines, end, rest = b"".join(parts).rpartition(b"\n")
+        yield lines + end, read_at
     if rest.strip():
         yield rest + b"\n", read_at
 
 
-def _read(source: BinaryIO, descriptor: int, queue: Arrivals) -> None:
+def _read(source: BinaryIO, descriptor: int, queue: Arrivals[bytes]) -> None:
     """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
     try:
         while not source.closed and (data := os.read(descriptor, READ_BYTES)):  # the data available
@@ -182,24 +206,33 @@ def read_camera(address: str, mosaic: Mosaic, idle_s: float) -> Input:
     reader = _opened(address)
     width, height = reader.getEventResolution()
     stream = _Stream(address, height, width, mosaic)
+    queue: Arrivals[Table] = Queue(MAX_BATCHES)
 
     def tables() -> Iterator[tuple[Table | None, float]]:
-        quiet_since = time.monotonic()
+        Thread(target=_receive, args=[reader, idle_s, queue], daemon=True).start()
+        yield from _arrived(queue, stream.patience_s)
+
+    return stream.input(tables(), queue, waits=False)
+
+
+def _receive(reader: Any, idle_s: float, queue: Arrivals[Table]) -> None:
+    """Queue a camera's events with their time of arrival, in a separate thread as in `_read`."""
+    end, quiet_since = None, time.monotonic()
+    try:
         while time.monotonic() - quiet_since < idle_s:
             batch = reader.getNextEventBatch()
             if batch is not None and not batch.isEmpty():
                 read_at, quiet_since = time.perf_counter(), time.monotonic()
                 columns = batch.timestamps(), batch.coordinates(), batch.polarities()
                 table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
-                yield table, read_at
-            elif stream.patience_s() == 0:
-                yield None, 0.0
+                queue.put((table, read_at))
             elif reader.isRunning():
                 time.sleep(POLL_S)
             else:
                 break
-
-    return stream.input(tables(), waits=False)
+    except Exception as error:
+        end = error
+    queue.put(end)
 
 
 def _opened(address: str) -> Any:

@@ -42,7 +42,7 @@ from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
 Item = TypeVar("Item")
 NICE = 10  # of the reading thread: those of a network wait for each other, so it slows down most where one gives way
-FILE_PIECES, LIVE_PIECES = 2, 512  # most pieces read ahead: a file has pieces of a million events, a pipe small ones
+PIECES_AHEAD = 2  # of a file, of a million events each
 MAX_LATENCY_S = 0.15  # from the arrival of a window's last event to its frame, where that can be reached
 MAX_BACKLOG_US = 1_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
 MAX_LOAD = 0.8  # share of the time that work on a camera's windows may take; above it no delay is ever made up for
@@ -108,10 +108,9 @@ class Ahead(Generic[Item]):
     """
 
     def __init__(self, items: Iterable[Item], most: int):
-        self._queue: Queue[tuple[list[Item], BaseException | None]] = Queue(most)
-        self._end: BaseException | None = None
+        self._queue: Queue[Item | BaseException] = Queue(most)
         self._stopped = False
-        Thread(target=self._fill, args=[items], daemon=True).start()  # daemon: a camera may deliver nothing any more
+        Thread(target=self._fill, args=[items], daemon=True).start()
 
     def __enter__(self) -> "Ahead[Item]":
         return self
@@ -122,19 +121,10 @@ class Ahead(Generic[Item]):
             self._queue.get()
 
     def __iter__(self) -> Iterator[Item]:
-        while items := self.take():
-            yield from items
-
-    def take(self, *, wait: bool = True) -> list[Item]:
-        """The items that are ready, `most` at most; `wait` for one if there is none. Empty at the end."""
-        items: list[Item] = []
-        most = self._queue.maxsize
-        while self._end is None and len(items) < most and ((wait and not items) or not self._queue.empty()):
-            more, self._end = self._queue.get()
-            items += more
-        if self._end is not None and wait and not items and not isinstance(self._end, StopIteration):
-            raise self._end
-        return items
+        while not isinstance(item := self._queue.get(), BaseException):
+            yield item
+        if not isinstance(item, StopIteration):
+            raise item
 
     def _fill(self, items: Iterable[Item]) -> None:
         torch.set_num_threads(1)  # more would put those of the network to sleep between operations
@@ -142,12 +132,12 @@ class Ahead(Generic[Item]):
         end: BaseException = StopIteration()
         try:
             for item in items:
-                self._queue.put(([item], None))
+                self._queue.put(item)
                 if self._stopped:
                     return
         except BaseException as error:
             end = error
-        self._queue.put(([], end))
+        self._queue.put(end)
 
 
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator[Frame]:
@@ -156,7 +146,7 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator
     If the rule has a step and the method has frames between the ends of its windows, windows follow each other, and
     each is cut into equal parts of about that step, with a frame at the end of each part.
 
-    Another thread reads the input ahead. Windows that are already available, such as those of a file, are processed in
+    Another thread reads a file ahead. Windows that are already available, such as those of a file, are processed in
     runs of up to `Recoverer.at_once` windows, overlapping ones one by one. If a live source does not wait and the
     processor is too slow for it, the windows that have arrived are joined to one. ValueError if no window is complete.
     """
@@ -183,63 +173,70 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator
                 arrived.append(piece.read_at)
                 yield window
 
-    with Ahead(source.pieces, FILE_PIECES if source.waits else LIVE_PIECES) as ahead:
-        if source.live:
-            runs = _live_runs(ahead.take, windows, arrived, most, source.waits)
-        else:
+    def runs() -> Iterator[list[EventWindow]]:
+        with Ahead(source.pieces, PIECES_AHEAD) as ahead:
             every = windows(ahead)
-            runs = iter(lambda: list(itertools.islice(every, most)), [])
-        for run in runs:
-            start = time.perf_counter()
-            history, prediction = advance(recoverer, history, run)
-            maps = each_map(prediction, Tensor.cpu)
-            done = time.perf_counter()
-            for k, window in enumerate(run):
-                came = [arrived.popleft() for _ in range(window.joined)][-1]
-                parts, of_parts = [window], each_map(maps, operator.itemgetter(slice(k, k + 1)))
-                if part_us and recoverer.between:
-                    parts = equal_parts(window, part_us)
-                    of_parts = recoverer.between(history[-1][1], np.array([part.stop_us for part in parts]))
-                for n, part in enumerate(parts):
-                    frame = each_map(of_parts, operator.itemgetter(n))
-                    _check_finite(frame, part)
-                    number += 1
-                    yield Frame(part, frame, (done - start) / len(run) / len(parts), done - came)
+            yield from iter(lambda: list(itertools.islice(every, most)), [])
+
+    for run in _live_runs(source, windows, arrived, most) if source.live else runs():
+        start = time.perf_counter()
+        history, prediction = advance(recoverer, history, run)
+        maps = each_map(prediction, Tensor.cpu)
+        done = time.perf_counter()
+        for k, window in enumerate(run):
+            came = [arrived.popleft() for _ in range(window.joined)][-1]
+            parts, of_parts = [window], each_map(maps, operator.itemgetter(slice(k, k + 1)))
+            if part_us and recoverer.between:
+                parts = equal_parts(window, part_us)
+                of_parts = recoverer.between(history[-1][1], np.array([part.stop_us for part in parts]))
+            for n, part in enumerate(parts):
+                frame = each_map(of_parts, operator.itemgetter(n))
+                _check_finite(frame, part)
+                number += 1
+                yield Frame(part, frame, (done - start) / len(run) / len(parts), done - came)
     if not number:
         raise ValueError(_too_short(source, rule, until_us))
 
 
 def _live_runs(
-    take: Callable[..., list[Piece]],
-    windows: Callable[[Iterable[Piece]], Iterator[EventWindow]],
-    arrived: Sequence[float],
-    most: int,
-    waits: bool,
+    source: Input, windows: Callable[[Iterable[Piece]], Iterator[EventWindow]], arrived: Sequence[float], most: int
 ) -> Iterator[list[EventWindow]]:
     """Yield runs of the windows that are there, joined to one if the source does not wait and they would be late.
 
-    `take` returns the pieces that are there (`Ahead.take`) and `windows` cuts them. `arrived` holds the time when the
-    last event of each window without a frame came.
+    `windows` cuts pieces. `arrived` holds the time when the last event of each window without a frame came. All that
+    has arrived is read before the next run, in this thread: another would compete with the network for the processor,
+    and fall behind further and further where others load it as well.
     """
+    pieces = iter(source.pieces)
     waiting: list[EventWindow] = []
     work_s: deque[float] = deque(maxlen=MEASURED)  # of a window: its step, and its writing if that is waited for
+    end: Exception | None = None
+
+    def more() -> bool:
+        return not source.waits and source.unread()
+
     while True:
-        backlog_us = waiting[-1].stop_us - waiting[0].stop_us if waiting else 0
-        if not waiting or (not waits and backlog_us < MAX_BACKLOG_US):
-            pieces = take(wait=not waiting)
-            if not (pieces or waiting):
+        while end is None and (not waiting or (more() and waiting[-1].stop_us - waiting[0].stop_us < MAX_BACKLOG_US)):
+            try:
+                waiting += windows([next(pieces)])
+            except Exception as error:  # the windows before it come first
+                end = error
+        if not waiting:
+            assert end is not None, "reading ends with windows, or with an exception"
+            if isinstance(end, StopIteration):
                 return
-            waiting += windows(pieces)
-        if len(waiting) > 1 and not waits and len(work_s) > 1:
+            raise end
+        measured = len(work_s) > 1
+        if len(waiting) > 1 and not source.waits and measured:
             usual_s, between_us = statistics.median_low(work_s), waiting[1].stop_us - waiting[0].stop_us
             late = time.perf_counter() - arrived[0] + len(waiting) * usual_s > MAX_LATENCY_S
             if late and usual_s > MAX_LOAD * between_us * 1e-6:
                 waiting = [join_windows(waiting)]
-        if waiting:
-            run, waiting = waiting[:most], waiting[most:]
-            start = time.perf_counter()
-            yield run
-            work_s.append((time.perf_counter() - start) / len(run))
+        number = most if source.waits or measured else 1
+        run, waiting = waiting[:number], waiting[number:]
+        start = time.perf_counter()
+        yield run
+        work_s.append((time.perf_counter() - start) / len(run))
 
 
 def _check_finite(frame: Prediction, window: EventWindow) -> None:

@@ -31,36 +31,30 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Replaces the clock of `frames_of`, and its reading thread by one that has the pieces that arrived by then."""
+    """Replaces the clock of `frames_of`."""
     clock = Clock()
-
-    class Arriving:
-        def __init__(self, pieces, most):
-            self.pieces = deque(pieces)
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *problem):
-            pass
-
-        def take(self, *, wait):
-            if wait and self.pieces:
-                clock.now_s = max(clock.now_s, self.pieces[0].read_at)
-            return [self.pieces.popleft() for piece in tuple(self.pieces) if piece.read_at <= clock.now_s]
-
-    monkeypatch.setattr("polarnet.recovery.stream.Ahead", Arriving)
     monkeypatch.setattr("polarnet.recovery.stream.time", clock)
     return clock
 
 
-def source(*, waits):
+def source(clock, *, waits, damaged=False):
     """A second and a half of a camera: an event in each channel every 0.1 ms, delivered every 2 ms."""
-    pieces = []
+    ahead = deque()
     for k in range(PIECES):
         channel = events_of([(k * PIECE_US + t_us, 1, 1, 1) for t_us in range(0, PIECE_US, 100)], HEIGHT, WIDTH)
-        pieces.append(Piece([channel] * 4, (k + 1) * PIECE_US, (k + 1) * PIECE_US * 1e-6))
-    return Input("camera", HEIGHT, WIDTH, pieces, live=True, waits=waits)
+        ahead.append(Piece([channel] * 4, (k + 1) * PIECE_US, (k + 1) * PIECE_US * 1e-6))
+
+    def pieces():
+        while ahead:
+            clock.now_s = max(clock.now_s, ahead[0].read_at)
+            yield ahead.popleft()
+        if damaged:
+            raise ValueError("damaged")
+
+    def unread():
+        return bool(ahead) and ahead[0].read_at <= clock.now_s
+
+    return Input("camera", HEIGHT, WIDTH, pieces(), live=True, waits=waits, unread=unread)
 
 
 def method(clock, work_s, taken):
@@ -87,7 +81,7 @@ def method(clock, work_s, taken):
 )
 def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkeypatch, step_us, windows, work_s):
     taken: list[int] = []
-    camera, rule = source(waits=False), WindowRule(WINDOW_US, step_us)
+    camera, rule = source(clock, waits=False), WindowRule(WINDOW_US, step_us)
     frames = list(frames_of(camera, rule, method(clock, work_s, taken)))
     assert sum(frame.window.joined for frame in frames) == windows
     assert clock.now_s < 1.5 + 0.3  # one by one, they would take up to 15 s
@@ -104,15 +98,22 @@ def test_windows_are_joined_if_the_processor_is_too_slow(clock, tmp_path, monkey
 
 
 def test_windows_stay_apart_if_the_processor_keeps_up_or_the_source_waits(clock):
-    frames = frames_of(source(waits=False), WindowRule(WINDOW_US, None), method(clock, 0.005, []))
+    frames = frames_of(source(clock, waits=False), WindowRule(WINDOW_US, None), method(clock, 0.005, []))
     beginning = list(itertools.islice(frames, 20))
     clock.now_s += 0.3
     rest = list(frames)
     assert [frame.window.joined for frame in (*beginning, *rest)] == [1] * 150
     assert rest[0].latency_s > 0.2
     assert rest[-1].latency_s < 0.01
-    frames = list(frames_of(source(waits=True), WindowRule(WINDOW_US, None), method(clock, 0.1, [])))
+    frames = list(frames_of(source(clock, waits=True), WindowRule(WINDOW_US, None), method(clock, 0.1, [])))
     assert [frame.window.stop_us for frame in frames] == [*range(WINDOW_US, 1_500_001, WINDOW_US)]
+
+
+def test_an_error_of_live_input_comes_after_the_frames_before_it(clock):
+    frames = frames_of(source(clock, waits=False, damaged=True), WindowRule(WINDOW_US, None), method(clock, 0.1, []))
+    assert sum(frame.window.joined for frame in itertools.takewhile(lambda one: one.window.stop_us < 1_500_000, frames))
+    with pytest.raises(ValueError, match="damaged"):
+        next(frames)
 
 
 def test_what_is_read_ahead_comes_in_order_and_an_error_after_what_was_before_it():
@@ -135,10 +136,3 @@ def test_reading_ahead_ends_with_its_reader_and_is_bounded_in_memory():
     while threading.active_count() > before:
         time.sleep(0.001)
     assert len(taken) <= 7
-    read = []
-    ahead = Ahead((read.append(k) or k for k in range(100)), 4)
-    while len(read) < 5:  # four in the queue, and the one that waits for room
-        time.sleep(0.001)
-    batches = list(iter(ahead.take, []))
-    assert max(map(len, batches)) <= 4
-    assert [item for batch in batches for item in batch] == list(range(100))
