@@ -96,6 +96,21 @@ def test_lines_are_handed_on_as_they_come_and_keep_their_time_while_nobody_reads
         assert all(before <= piece.read_at <= after for piece in filled(live))
 
 
+def test_what_has_arrived_is_known_and_reading_it_never_waits_for_more():
+    with pipe() as (source, camera):
+        camera.write(b"4 3\n0 0 0 1 0\n")
+        live = read_lines(source, "pipe", None)
+        assert next(live.pieces).until_us == 0
+        for part_of_a_line in (b"12 ", b"0 0 1"):
+            assert not live.unread()
+            camera.write(part_of_a_line)
+            while not live.unread():
+                time.sleep(0.001)
+            assert not any(map(len, next(live.pieces).channels))
+        camera.write(b" 0\n")
+        assert next(live.pieces).until_us == 12
+
+
 def test_late_events_and_single_bad_lines_are_left_out_and_counted(tmp_path):
     with pipe() as (source, camera):
         camera.write(b"4 3\n100 0 0 1 0\n200 0 0 1 0\n")
