@@ -63,12 +63,19 @@ class _Stream:
 
     def input(self, tables: Iterable[tuple[Table | None, float]], queue: Arrivals, *, waits: bool) -> Input:
         """Tables and their times of arrival as an input; None where events were held back for long enough."""
+        _warm_up(self._mosaic)
         height, width = (side // 2 if self._mosaic else side for side in self._sensor)
         blocks = itertools.chain.from_iterable(self._add(*one) for one in itertools.chain(tables, [(None, 0.0)]))
         pieces, repairs = pieces_of(blocks), [(self.name, self.counts)]
         return Input(
             self.name, height, width, pieces, repairs, live=True, waits=waits, unread=lambda: not queue.empty()
         )
+
+    def table(self, lines: bytes) -> Table:
+        """The rows of complete lines; the others are counted."""
+        columns = np.zeros(5 if self._mosaic is None else 4, np.int64)
+        rows = [*rows_of(lines, columns, self.counts, "unreadable_lines")] or [np.empty((0, len(columns)), np.int64)]
+        return rows[0] if len(rows) == 1 else np.concatenate(rows)
 
     def _add(self, table: Table | None, read_at: float) -> Iterator[tuple[list[Events], float]]:
         """Channels of the next rows `t x y p` or `t x y p angle`, and the time of arrival of the first of them."""
@@ -101,6 +108,13 @@ class _Stream:
         return Events(t, x, y, p.sign(), *self._sensor)
 
 
+def _warm_up(mosaic: Mosaic | None) -> None:
+    """Read a line to nowhere, so that the first of a camera does not wait until kernels are loaded or compiled."""
+    stream = _Stream("", 2, 2, mosaic)
+    for _ in stream._add(stream.table(b"0 0 0 0" + b" 0" * (mosaic is None) + b"\n"), 0.0):
+        pass
+
+
 def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
     """Read lines as they arrive, up to the end of the source, which is closed unless it is standard input.
 
@@ -116,14 +130,13 @@ def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
     stream = _Stream(name, height, width, mosaic)
 
     def tables() -> Iterator[tuple[Table | None, float]]:
-        shift, number = np.zeros(4 if mosaic else 5, np.int64), 0
+        number = 0
         for data, read_at in lines:
             if data is None:
                 yield None, read_at
                 continue
             number += data.count(b"\n")
-            rows = [np.empty((0, len(shift)), np.int64), *rows_of(data, shift, stream.counts, "unreadable_lines")]
-            yield np.concatenate(rows), read_at
+            yield stream.table(data), read_at
             refuse_much_damage(name, stream.counts, number, (*SAFE, "time_glitches"))
 
     return stream.input(tables(), queue, waits=waits)
