@@ -89,6 +89,7 @@ class _Stream:
             self.counts["bad_angle"] += int(np.count_nonzero(good & ~known))
             good &= known
             p *= 1 + channel  # the clock sorts the columns of `Block` alone, so p holds the channel too
+        t = t.copy()  # a view would hold the whole table
         block = Block(t, x.astype(np.int16), y.astype(np.int16), p.astype(np.int8))
         block = block if good.all() else block.rows(good)
         for ready in self._clock.ordered(block, final=table is None):
