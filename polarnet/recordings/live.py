@@ -16,8 +16,6 @@ import stat
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from queue import Empty, Queue
-from threading import Thread
 from typing import Any, BinaryIO, TypeAlias, TypeVar
 
 import numpy as np
@@ -25,6 +23,7 @@ import torch
 from jaxtyping import Int64
 
 from polarnet.events.stream import MAX_SIDE, Events, split_mosaic
+from polarnet.recordings.ahead import Ahead
 from polarnet.recordings.arrangements import Input, pieces_of
 from polarnet.recordings.formats.lines import lines_of, numbers_of, rows_of
 from polarnet.recordings.repair import Clock, refuse_much_damage, usable
@@ -42,10 +41,10 @@ SCHEME, CAMERA = "dv://", "camera"
 NETWORK = re.compile(r"(?P<host>[^:/]+):(?P<port>\d{1,5})")
 
 Table: TypeAlias = Int64[np.ndarray, "n columns"]
+Tables: TypeAlias = Iterable[tuple[Table | None, float]]
 Lines: TypeAlias = Iterator[tuple[bytes | None, float]]
+Patience: TypeAlias = Callable[[], float | None]
 Data = TypeVar("Data")
-Arrivals: TypeAlias = Queue[tuple[Data, float] | Exception | None]
-"""Data and their times of arrival, then None, or the exception that ended them."""
 
 
 class _Stream:
@@ -61,15 +60,13 @@ class _Stream:
         """Seconds until the events that are held back are to be flushed; None if there are none."""
         return max(0.0, self._since + MAX_WAIT_S - time.perf_counter()) if self._clock.waiting else None
 
-    def input(self, tables: Iterable[tuple[Table | None, float]], queue: Arrivals, *, waits: bool) -> Input:
+    def input(self, tables: Tables, unread: Callable[[], bool], *, waits: bool) -> Input:
         """Tables and their times of arrival as an input; None where events were held back for long enough."""
         _warm_up(self._mosaic)
         height, width = (side // 2 if self._mosaic else side for side in self._sensor)
         blocks = itertools.chain.from_iterable(self._add(*one) for one in itertools.chain(tables, [(None, 0.0)]))
-        pieces, repairs = pieces_of(blocks), [(self.name, self.counts)]
-        return Input(
-            self.name, height, width, pieces, repairs, live=True, waits=waits, unread=lambda: not queue.empty()
-        )
+        repairs = [(self.name, self.counts)]
+        return Input(self.name, height, width, pieces_of(blocks), repairs, live=True, waits=waits, unread=unread)
 
     def table(self, lines: bytes) -> Table:
         """The rows of complete lines; the others are counted."""
@@ -123,14 +120,13 @@ def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
     (and 8) are unusable for the same reason, or where the first line is not a size.
     """
     waits = stat.S_ISREG(os.fstat(source.fileno()).st_mode)
-    queue: Arrivals[bytes] = Queue(MAX_READ_AHEAD // (READ_BYTES if waits else PIPE_BYTES))
     own = os.dup(source.fileno())  # a duplicate, so that a file opened later cannot get its number
-    Thread(target=_read, args=[source, own, queue], daemon=True).start()
+    ahead = Ahead(_read(source, own), MAX_READ_AHEAD // (READ_BYTES if waits else PIPE_BYTES))
     stream: _Stream | None = None
-    (width, height), lines = _size(name, _whole_lines(queue, lambda: stream.patience_s() if stream else None))
+    (width, height), lines = _size(name, _whole_lines(ahead, lambda: stream.patience_s() if stream else None))
     stream = _Stream(name, height, width, mosaic)
 
-    def tables() -> Iterator[tuple[Table | None, float]]:
+    def tables() -> Tables:
         number = 0
         for data, read_at in lines:
             if data is None:
@@ -140,7 +136,7 @@ def read_lines(source: BinaryIO, name: str, mosaic: Mosaic | None) -> Input:
             yield stream.table(data), read_at
             refuse_much_damage(name, stream.counts, number, (*SAFE, "time_glitches"))
 
-    return stream.input(tables(), queue, waits=waits)
+    return stream.input(tables(), ahead.ready, waits=waits)
 
 
 def _size(name: str, lines: Lines) -> tuple[list[int], Lines]:
@@ -158,37 +154,27 @@ def _size(name: str, lines: Lines) -> tuple[list[int], Lines]:
     return [*map(int, words)], lines
 
 
-def _arrived(queue: Arrivals[Data], patience_s: Callable[[], float | None]) -> Iterator[tuple[Data | None, float]]:
-    """The data of a queue with their times of arrival, None where events were held back for long enough."""
+def _arrived(ahead: Ahead[tuple[Data, float]], patience_s: Patience) -> Iterator[tuple[Data | None, float]]:
+    """Data with their times of arrival, None where events were held back for long enough."""
     while True:
         try:
-            arrived = queue.get(timeout=patience_s())
-        except Empty:
-            yield None, time.perf_counter()
-            continue
-        if arrived is None:
+            yield ahead.within(patience_s()) or (None, time.perf_counter())
+        except StopIteration:
             return
-        if isinstance(arrived, Exception):
-            raise arrived
-        yield arrived
 
 
-def _whole_lines(queue: Arrivals[bytes], patience_s: Callable[[], float | None]) -> Lines:
+def _whole_lines(ahead: Ahead[tuple[bytes, float]], patience_s: Patience) -> Lines:
     """Complete lines with their time of arrival, none where none is complete yet; None as in `_arrived`.
 
     At the end of the input, also an incomplete last line.
     """
     rest, read_at = b"", 0.0
-    for data, read_at in _arrived(queue, patience_s):
+    for data, read_at in _arrived(ahead, patience_s):
         if data is None:
             yield None, read_at
             continue
         parts, size = [rest, data], len(data)
-        while size < READ_BYTES and not queue.empty():  # data already waiting joins this piece
-            more = queue.get()
-            if not isinstance(more, tuple):
-                queue.put(more)
-                break
+        while size < READ_BYTES and ahead.ready() and (more := next(ahead, None)):  # what is there joins this piece
             parts.append(more[0])
             size += len(more[0])
         lines, end, rest = b"".join(parts).rpartition(b"\n")
@@ -197,18 +183,17 @@ def _whole_lines(queue: Arrivals[bytes], patience_s: Callable[[], float | None])
         yield rest + b"\n", read_at
 
 
-def _read(source: BinaryIO, descriptor: int, queue: Arrivals[bytes]) -> None:
-    """Queue incoming data with its time of arrival, in a separate thread, since recovery may be busy meanwhile."""
+def _read(source: BinaryIO, descriptor: int) -> Iterator[tuple[bytes, float]]:
+    """Incoming data with its time of arrival."""
     try:
         while not source.closed and (data := os.read(descriptor, READ_BYTES)):  # the data available
-            queue.put((data, time.perf_counter()))
+            yield data, time.perf_counter()
     except OSError:  # the other end was closed
         return
     finally:
         os.close(descriptor)
         if source is not sys.stdin.buffer:
             source.close()
-        queue.put(None)
 
 
 def read_camera(address: str, mosaic: Mosaic, idle_s: float) -> Input:
@@ -220,33 +205,25 @@ def read_camera(address: str, mosaic: Mosaic, idle_s: float) -> Input:
     reader = _opened(address)
     width, height = reader.getEventResolution()
     stream = _Stream(address, height, width, mosaic)
-    queue: Arrivals[Table] = Queue(MAX_BATCHES)
-
-    def tables() -> Iterator[tuple[Table | None, float]]:
-        Thread(target=_receive, args=[reader, idle_s, queue], daemon=True).start()
-        yield from _arrived(queue, stream.patience_s)
-
-    return stream.input(tables(), queue, waits=False)
+    ahead = Ahead(_batches(reader, idle_s), MAX_BATCHES)
+    tables = _arrived(ahead, stream.patience_s)
+    return stream.input(tables, ahead.ready, waits=False)
 
 
-def _receive(reader: Any, idle_s: float, queue: Arrivals[Table]) -> None:
-    """Queue a camera's events with their time of arrival, in a separate thread as in `_read`."""
-    end, quiet_since = None, time.monotonic()
-    try:
-        while time.monotonic() - quiet_since < idle_s:
-            batch = reader.getNextEventBatch()
-            if batch is not None and not batch.isEmpty():
-                read_at, quiet_since = time.perf_counter(), time.monotonic()
-                columns = batch.timestamps(), batch.coordinates(), batch.polarities()
-                table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
-                queue.put((table, read_at))
-            elif reader.isRunning():
-                time.sleep(POLL_S)
-            else:
-                break
-    except Exception as error:
-        end = error
-    queue.put(end)
+def _batches(reader: Any, idle_s: float) -> Iterator[tuple[Table, float]]:
+    """Rows `t x y p` of a camera with their time of arrival."""
+    quiet_since = time.monotonic()
+    while time.monotonic() - quiet_since < idle_s:
+        batch = reader.getNextEventBatch()
+        if batch is not None and not batch.isEmpty():
+            read_at, quiet_since = time.perf_counter(), time.monotonic()
+            columns = batch.timestamps(), batch.coordinates(), batch.polarities()
+            table = np.concatenate([np.array(one, np.int64).reshape(batch.size(), -1) for one in columns], axis=1)
+            yield table, read_at
+        elif reader.isRunning():
+            time.sleep(POLL_S)
+        else:
+            break
 
 
 def _opened(address: str) -> Any:

@@ -3,7 +3,6 @@
 import itertools
 import math
 import operator
-import os
 import statistics
 import time
 from array import array
@@ -11,12 +10,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from queue import Queue
-from threading import Thread
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from polarnet.events.streaming import (
@@ -32,6 +28,7 @@ from polarnet.methods.method import Method, Recoverer, Setup, each_map, weights_
 from polarnet.methods.overlap import advance, begin, equal_parts, warm_up
 from polarnet.metrics.similarity import frame_scores
 from polarnet.networks.weights import shipped_weights
+from polarnet.recordings.ahead import Ahead
 from polarnet.recordings.arrangements import Input, Piece
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.runtime.machine import tune
@@ -40,11 +37,10 @@ from polarnet.storage.true_frames import TrueFrames
 from polarnet.terminal.progress import PATIENCE_S, ProgressBar, said_after
 
 BAR = "{desc}: {n:.2f} s [{elapsed}{postfix}]"
-Item = TypeVar("Item")
 NICE = 10  # of the reading thread: those of a network wait for each other, so it slows down most where one gives way
 PIECES_AHEAD = 2  # of a file, of a million events each
 MAX_LATENCY_S = 0.15  # from the arrival of a window's last event to its frame, where that can be reached
-MAX_BACKLOG_US = 5_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
+MAX_BACKLOG_US = 1_000_000  # no more is read while windows of this time wait, as where a file comes through a pipe
 MAX_LOAD = 0.8  # share of the time that work on a camera's windows may take; above it no delay is ever made up for
 MEASURED = 9  # latest measurements of that work whose median counts, so that one delay does not
 MAX_GAP = 0.01  # between the end of a window and its true frame, as a fraction of the window
@@ -101,45 +97,6 @@ def open_method(
     return recoverer, f"network {weights_record(method, setup)['network']} ({setup.precision}), {weights}{whole}"
 
 
-class Ahead(Generic[Item]):
-    """The items of an iterable in their order, taken from it by another thread, at most `most` in advance.
-
-    An exception of the iterable is raised after the items before it. As a context manager it lets the thread end.
-    """
-
-    def __init__(self, items: Iterable[Item], most: int):
-        self._queue: Queue[Item | BaseException] = Queue(most)
-        self._stopped = False
-        Thread(target=self._fill, args=[items], daemon=True).start()
-
-    def __enter__(self) -> "Ahead[Item]":
-        return self
-
-    def __exit__(self, *problem: object) -> None:
-        self._stopped = True
-        while not self._queue.empty():  # the thread may wait for room
-            self._queue.get()
-
-    def __iter__(self) -> Iterator[Item]:
-        while not isinstance(item := self._queue.get(), BaseException):
-            yield item
-        if not isinstance(item, StopIteration):
-            raise item
-
-    def _fill(self, items: Iterable[Item]) -> None:
-        torch.set_num_threads(1)  # more would put those of the network to sleep between operations
-        os.nice(NICE)  # Linux: of this thread alone
-        end: BaseException = StopIteration()
-        try:
-            for item in items:
-                self._queue.put(item)
-                if self._stopped:
-                    return
-        except BaseException as error:
-            end = error
-        self._queue.put(end)
-
-
 def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator[Frame]:
     """Yield a frame for each window, of live input as soon as the window's last event has arrived.
 
@@ -174,7 +131,7 @@ def frames_of(source: Input, rule: WindowRule, recoverer: Recoverer) -> Iterator
                 yield window
 
     def runs() -> Iterator[list[EventWindow]]:
-        with Ahead(source.pieces, PIECES_AHEAD) as ahead:
+        with Ahead(source.pieces, PIECES_AHEAD, NICE) as ahead:
             every = windows(ahead)
             yield from iter(lambda: list(itertools.islice(every, most)), [])
 
@@ -211,12 +168,10 @@ def _live_runs(
     waiting: list[EventWindow] = []
     work_s: deque[float] = deque(maxlen=MEASURED)  # of a window: its step, and its writing if that is waited for
     end: Exception | None = None
-
-    def more() -> bool:
-        return not source.waits and source.unread()
-
     while True:
-        while end is None and (not waiting or (more() and waiting[-1].stop_us - waiting[0].stop_us < MAX_BACKLOG_US)):
+        while end is None and (
+            not waiting or (source.unread() and waiting[-1].stop_us - waiting[0].stop_us < MAX_BACKLOG_US)
+        ):
             try:
                 waiting += windows([next(pieces)])
             except Exception as error:  # the windows before it come first

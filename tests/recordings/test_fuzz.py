@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from polarnet.events.stream import validate
@@ -20,7 +20,8 @@ from studies.recording_files import FILES
 FUZZ = settings(deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 CASES = FUZZ.max_examples
 PLACES = st.one_of(st.integers(0, 200), st.integers(0, 2**20))
-BYTES = st.one_of(st.binary(max_size=12), st.sampled_from([bytes([code]) for code in b"\0\n ,-.09e\x7f\xff"]))
+CODES = [bytes([code]) for code in b"\0\n ,-.09e\x7f\xff"]
+BYTES = st.one_of(st.binary(max_size=12), st.sampled_from(CODES), st.just(b"?\n" * 20))  # 20 lines: too many to repair
 DAMAGE = st.lists(st.tuples(PLACES, st.sampled_from([0, 1, 2, 7, 40, 2**20]), BYTES), max_size=6)
 """Changes of a file in order: byte, number of bytes removed there, and bytes inserted instead."""
 
@@ -63,7 +64,6 @@ def test_a_damaged_file_ends_in_events_or_in_the_reason(form, tmp_path, make_ran
     endings: Counter[str] = Counter()
 
     @FUZZ
-    @example([(0, 2**30, b"?" * 100)], next(iter(sound)), True, 10)
     @given(DAMAGE, st.sampled_from([*sound]), st.booleans(), st.integers(1, 100))
     def one_case(damage, file, says_format, size):
         content = sound[file]
@@ -77,5 +77,5 @@ def test_a_damaged_file_ends_in_events_or_in_the_reason(form, tmp_path, make_ran
     one_case()
     assert endings.total() >= CASES
     assert set(endings) <= {"read", "repaired", "refused"}
-    assert endings["refused"] > 0
+    assert endings["refused"] > CASES // 20
     assert endings["read"] + endings["repaired"] > 0

@@ -12,8 +12,9 @@ from event_fixtures import events_of
 
 from polarnet.events.streaming import WindowRule
 from polarnet.methods.method import Recoverer
+from polarnet.recordings.ahead import Ahead
 from polarnet.recordings.arrangements import Piece
-from polarnet.recovery.stream import MAX_LATENCY_S, Ahead, Input, frames_of, recover
+from polarnet.recovery.stream import MAX_LATENCY_S, Input, frames_of, recover
 from polarnet.recovery.writer import RecoveryWriter
 from polarnet.stokes import Prediction
 
@@ -137,3 +138,9 @@ def test_reading_ahead_ends_with_its_reader_and_is_bounded_in_memory():
     while threading.active_count() > before:
         time.sleep(0.001)
     assert len(taken) <= 7
+    read = []
+    ahead = Ahead((read.append(k) or k for k in range(100)), 4)
+    while len(read) < 5:  # four in the queue, and the one that waits for room
+        time.sleep(0.001)
+    assert len(read) == 5
+    assert list(ahead) == list(range(100))
