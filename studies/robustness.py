@@ -167,7 +167,7 @@ def contexts_of(
 
 def scored_sequence(
     scenes: SceneStore,
-    config: Config,
+    overrides: Sequence[str],
     contexts: Mapping[str, Context],
     constant: float,
     mode: str,
@@ -175,6 +175,7 @@ def scored_sequence(
     name: str,
 ) -> Scores:
     """Scores of all methods on one sequence, of a `kind` of layers unless empty, without the windows of the warm-up."""
+    config = settings(*overrides)  # a worker gets the overrides, because settings cannot be pickled
     test = layers.layered(scenes, name, config, kind) if kind else simulated(scenes, name, config)
     first_context = next(iter(contexts.values()))
     rows, _ = available(ROWS, first_context)
@@ -346,11 +347,12 @@ def tables_of(
         others = [mean for source, of_source in means.items() if source != name for mean in of_source]
         constant = statistics.fmean(others) if others else train_mean
         for images, overrides in parts:
-            config = settings(*given.set, *overrides)
+            all_overrides = *given.set, *overrides
+            config = settings(*all_overrides)
             contexts = contexts_of(name, overrides, train_mean, given)
             scenes = scenes_of(images, config)
             kind = name.partition(".")[2] if given.mode == LAYERS else ""
-            task = functools.partial(scored_sequence, scenes, config, contexts, constant, given.mode, kind)
+            task = functools.partial(scored_sequence, scenes, all_overrides, contexts, constant, given.mode, kind)
             one = functools.reduce(Scores.__add__, config.mapper("sequences")(task, list(scenes.sequences)))
             results[name] = results[name] + one if name in results else one
         tables[name] = table_of(results[name])

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import json
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from polarnet.storage.scenes import SceneStore
 from studies.study import ROOT
 
 
+@functools.cache
 def settings(*overrides: str) -> Config:
     """The configuration of a condition."""
     return load(ROOT, ["experiment=photographs", *overrides])
