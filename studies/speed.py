@@ -12,9 +12,6 @@
   pixels behind each polarizer, and on the 130 x 173 of a PDAVIS. From a store: how many times as fast as real time.
   `--live`, `--seconds` (60) of lines through a pipe: latency, joined windows, and memory in the second and the last
   third of the time. --write: docs/results/speed.json.
-- gpu: `network` on the GPU without blocks, and how far its DoLP is from the processor's; windows a second and the
-  GPU's largest memory of training steps of the DoLP networks on windows of the default size, by visits in a batch.
-  --write: docs/results/speed.json, section gpu.
 """
 
 import re
@@ -29,27 +26,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from polarnet.config.tree import Config, load
+from polarnet.config.tree import load
 from polarnet.events.stream import Events, concatenate, shifted
 from polarnet.events.streaming import EventWindow, WindowCutter, WindowRule
 from polarnet.methods.dolp_network import dolp_recoverer
-from polarnet.networks.registry import NETWORKS, load_network
+from polarnet.networks.registry import load_network
 from polarnet.networks.weights import shipped_weights
 from polarnet.reports.artefacts import git
 from polarnet.runtime.machine import configure, precision_on, usable_cores
 from polarnet.storage.events import EventStore
-from polarnet.training.dolp import dolp_task
-from polarnet.training.engine.loop import train_batch
-from polarnet.training.engine.optimizers import OPTIMIZERS
-from polarnet.training.engine.sequences import Windows
 from studies.simulation_run import timed_run
 from studies.study import ROOT, Measurement, command_line, in_own_process, measure_sections
 
 SIZES = ((120, 180), (260, 346), (480, 640))
 RUNS, TIMED_WINDOWS, WARM_RUNS = 3, 12, 3
 KINDS = ("file", "camera")
-CPU, GPU = torch.device("cpu"), torch.device("cuda")
-BATCHES, TRAINED_STEPS = (1, 8, 32), 6
+CPU = torch.device("cpu")
 SHIFT = 2  # pixels per window of the points, whose motion the network finds
 EVENTS_PER_PIXEL = 0.8  # a window; the default sensor's mean
 WINDOW_US = round(1e6 / 30)
@@ -60,12 +52,12 @@ EVENTS_PER_S, CHUNKS_PER_S, FILE_SECONDS, LIVE_DIGITS = 1_000_000, 100, 10, 10
 ROUNDS = 3  # processes of each checkout, of each model and number of threads
 
 
-def windows_per_s(height: int, width: int, binning: int | None, device: torch.device = CPU) -> dict[str, float]:
+def windows_per_s(height: int, width: int, binning: int | None) -> dict[str, float]:
     """Windows a second of the network on random points that move, in memory, as precise as `recover`.
 
     `file` takes as many at once as `recover` of a file, `camera` one after the other.
     """
-    recoverer = dolp_recoverer(*load_network(shipped_weights()), device, precision_on(device, "auto"), binning=binning)
+    recoverer = dolp_recoverer(*load_network(shipped_weights()), CPU, precision_on(CPU, "auto"), binning=binning)
     rates = {}
     for name, size, runs in (("file", recoverer.at_once(height, width), RUNS), ("camera", 1, TIMED_WINDOWS)):
         count = size * (WARM_RUNS + runs)
@@ -127,50 +119,6 @@ def measure_turns(before: Path, threads: int) -> tuple[dict[str, Any], dict[str,
         figures[size] = {"before": old, "now": new, "speedup": speedup}
     headlines = {f"speedup_{size.replace(' ', '')}": one["speedup"] for size, one in figures.items()}
     return {"threads": threads, "commit_before": git(before, "rev-parse", "HEAD"), "sizes": figures}, headlines
-
-
-def measure_gpu() -> tuple[dict[str, Any], dict[str, Any]]:
-    """Windows a second of recovery by size of sensor and of training by network and batch, on the GPU."""
-    config = load(ROOT, ["experiment=photographs"])
-    configure(config.runtime, config.seed)
-    height, width = SIZES[0]
-    windows = random_windows(height, width, TIMED_WINDOWS)
-    maps = []
-    for device in (CPU, GPU):
-        recoverer = dolp_recoverer(*load_network(shipped_weights()), device)
-        maps.append(recoverer.step(recoverer.start(height, width), windows)[1].dolp.cpu())
-    recovery = {f"{height} x {width}": windows_per_s(height, width, None, GPU) for height, width in SIZES}
-    training: dict[str, dict[str, float]] = {}
-    for name in NETWORKS:
-        of_network = load(ROOT, ["experiment=photographs", f"network={name}"])
-        training |= {f"{name}, {batch}": training_cost(of_network, batch) for batch in BATCHES}
-    figures = {
-        "gpu": torch.cuda.get_device_name(),
-        "dolp_difference": float((maps[0] - maps[1]).abs().max()),
-        "precision": precision_on(GPU, "auto"),
-        "recovery": recovery,
-        "windows_per_step": config.train.bptt_windows,
-        "training": training,
-    }
-    return figures, {}
-
-
-def training_cost(config: Config, batch: int) -> dict[str, float]:
-    """Windows a second and largest memory in GiB of a training's steps in batches of `batch` visits, on the GPU."""
-    task = dolp_task(config.network, config.network_config, config.train, config.loss, None, config.seed)
-    network = task.network.to(GPU, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = OPTIMIZERS[task.optimizer](network, config.train.learning_rate)
-    (height, width), windows, inputs = SIZES[0], config.train.bptt_windows, task.description["in_channels"]
-    events = torch.randint(-1, 2, (windows, batch, inputs, height, width), dtype=torch.int8)
-    dolp, aolp = torch.rand(2, windows, batch, height, width)
-    visits = Windows([config.network] * batch, events, dolp, aolp, torch.empty(0, batch, 4, height, width))
-    torch.cuda.reset_peak_memory_stats()
-    for step in range(WARM_RUNS + TRAINED_STEPS):
-        if step == WARM_RUNS:
-            start = time.perf_counter()
-        train_batch(task, optimizer, visits, config.train, GPU)  # returns the loss, so that the GPU has finished
-    rate = TRAINED_STEPS * batch * windows / (time.perf_counter() - start)
-    return {"windows_per_s": round(rate, 1), "peak_gib": round(torch.cuda.max_memory_allocated() / 2**30, 2)}
 
 
 def measure_models() -> dict[str, dict[str, Any]]:
@@ -278,7 +226,6 @@ def main() -> None:
         "simulation": ("emulation", "models", lambda _: (measure_models(), {})),
         "live": ("speed", "live", lambda given: measure_live(given.seconds)),
         "turns": ("speed", "turns", lambda given: measure_turns(given.before, given.threads)),
-        "gpu": ("speed", "gpu", lambda _: measure_gpu()),
     }
     measure_sections(parser, sections, default=("network", "simulation", "live"))
 
