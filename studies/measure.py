@@ -26,13 +26,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+from polarnet.runtime.machine import usable_cores
 from studies.study import ROOT, machine_record, read_results, scores_and_costs, uncommitted, write_section
 
 SETS = "--photographs {shared}/data/rgb --measured {shared}/data/polarization {shared}/data/polarization_more"
 FIRENET = "data/external/firenet_1000.pth.tar"
 LARGE = (
     f"{SETS} --photographs-large {{shared}}/data/rgb_more --work {{work}}/robustness --limit 24 --sensor-limit 12 "
-    f"--set +rows.firenet_published={{{{needs:{FIRENET},settings:methods}}}} --write"
+    f"--set runtime.workers={usable_cores()} +rows.firenet_published={{{{needs:{FIRENET},settings:methods}}}} --write"
 )
 STUDIES = {
     ("robustness", "test"): "studies.robustness " + LARGE,
