@@ -1,7 +1,12 @@
+import numpy as np
 import pytest
+import torch
 
 from polarnet.benchmark.score import FrameScore
-from studies.robustness import SENSORS, Scores, headlines, table_of
+from polarnet.benchmark.sequences import TestSequence
+from polarnet.events.stream import Events
+from polarnet.stokes import StokesFrames
+from studies.robustness import SENSORS, Scores, filtered_with, headlines, table_of
 from studies.scored_pictures import settings, sources_of
 
 ERRORS = {"pale": 0.001, "middle": 0.01, "strong": 0.1}
@@ -46,3 +51,16 @@ def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
 def test_every_sensor_but_the_default_changes_the_configuration():
     default = settings()
     assert [name for name, overrides in SENSORS.items() if settings(*overrides) == default] == ["default"]
+
+
+def test_the_filter_with_frames_shows_the_frame_where_no_event_came_and_nowhere_more_than_full_polarization():
+    stokes = torch.tensor([0.3, 0.4])[None, :, None, None].expand(1, 2, 2, 2)
+    frames = StokesFrames(np.array([0]), stokes, torch.ones(1, 2, 2, dtype=torch.bool))
+    count, first = 200, np.zeros(200, np.int64)
+    burst = Events.from_columns(100 * np.arange(count), first, first, first + 1, height=2, width=2)
+    none = Events.from_columns(first[:0], first[:0], first[:0], first[:0], height=2, width=2)
+    maps = torch.zeros(1, 2, 2)
+    test = TestSequence("name", "scene", [none, burst, none, none], torch.tensor([0, 33_333]), maps, maps, maps)
+    dolp = filtered_with(frames, test, settings()).dolp[0]
+    assert dolp[1].tolist() == pytest.approx([0.5, 0.5], abs=1e-6)
+    assert dolp[0, 0] == 1
