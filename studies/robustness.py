@@ -74,6 +74,8 @@ ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_publishe
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
 OFFSET = ("offset", "no_offset_mse")  # of atanh(s1) and atanh(s2) in a frame, and the MSE of DoLP without it
+BESIDE = ("psnr", "corr", *OFFSET)
+"""Scores in the tables beside the MSE."""
 FRAMES_HZ = (1, 5, 20)  # of the camera
 BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`recover --step`), and of the camera's
 WITH_FRAMES = f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"
@@ -304,7 +306,7 @@ def warmup_windows(config: Config) -> int:
 
 def table_of(scores: Scores) -> dict[str, Any]:
     """Means over scenes of each row's scores, MSE and median MSE also relative to the oracle mean's."""
-    means = {name: scene_means(scores.rows, name) for name in ("mse", "psnr", *OFFSET)}
+    means = {name: scene_means(scores.rows, name) for name in ("mse", *BESIDE)}
     errors = means["mse"]
     oracle = errors["oracle_mean"]
     table: dict[str, Any] = {"scenes": len(oracle), "mean_dolp": statistics.fmean(scores.dolp.values()), "rows": {}}
@@ -314,7 +316,7 @@ def table_of(scores: Scores) -> dict[str, Any]:
             "mse": mse,
             "mse_over_oracle_mean": mse / statistics.fmean(oracle.values()),
             "median_over_oracle_mean": median / statistics.median(oracle.values()),
-            **{name: statistics.fmean(means[name][row].values()) for name in ("psnr", *OFFSET) if row in means[name]},
+            **{name: statistics.fmean(means[name][row].values()) for name in BESIDE if row in means[name]},
         }
         if row in scores.reliability:
             table["rows"][row]["error_factor"] = float(np.exp(scores.reliability[row].log_error()))
