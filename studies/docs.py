@@ -126,16 +126,8 @@ def rows_of(table: Table, results: Results) -> Iterator[dict[str, Any]]:
 
 
 def markdown(table: Table, results: Results) -> str:
-    """A GitHub table: numbers to the right, text and the names of the rows (the first column) to the left.
-
-    ValueError for a column without any value.
-    """
+    """A GitHub table: numbers to the right, text and the names of the rows (the first column) to the left."""
     cells = [[_cell(form, row, results) for form in table.columns.values()] for row in rows_of(table, results)]
-    for heading, column in zip(table.columns, zip(*cells, strict=True), strict=False):
-        if set(column) == {"-"}:
-            raise ValueError(
-                f"column {heading!r}: docs/results/{table.file}.json has none of its values; measure again"
-            )
     numeric = [all(cell[:1] in "+-0123456789" for cell in column) for column in zip(*cells, strict=True)]
     numeric[:1] = [False]
     rule = "|".join("---:" if right else "---" for right in numeric)

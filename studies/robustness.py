@@ -73,9 +73,8 @@ CONSTANT = "constant_real"
 ROWS = ("zeros", "train_mean", "oracle_mean", "highpass+gain", "firenet_published+gain")
 NO_TRUTH = ("zeros", "train_mean", CONSTANT, "highpass+gain", "firenet_published+gain")
 """Rows that need no truth, against which ours is compared on measured scenes."""
-OFFSET = ("offset", "no_offset_mse")  # of atanh(s1) and atanh(s2) in a frame, and the MSE of DoLP without it
-BESIDE = ("psnr", "corr", *OFFSET)
-"""Scores in the tables beside the MSE."""
+BESIDE = ("psnr", "corr", "offset", "no_offset_mse")
+"""Scores in the tables beside the MSE; `polarnet.metrics.offset` defines the last two."""
 FRAMES_HZ = (1, 5, 20)  # of the camera
 BETWEEN_HZ, BETWEEN_FRAMES_HZ = 2000, 5  # rate of frames between windows (`recover --step`), and of the camera's
 WITH_FRAMES = f"{WHOLE}, {BETWEEN_FRAMES_HZ} frames/s"
@@ -83,7 +82,7 @@ AT_RATE = f"{WITH_FRAMES}, at {BETWEEN_HZ} Hz"
 BETWEEN_US = 12_500  # time between those that are scored, every 25th
 EXPOSURE_US, EXPOSED = 10_000, 5  # length of a frame's exposure, and times in it at which light is rendered
 FULL_WELL, READ_NOISE, DIGITS = 20_000, 10 ** (-55 / 20), 1023  # electrons; of white (55 dB); 10 bits
-FILTER_HZ = 5.0  # cutoff of that filter, of 0.5 to 50 Hz the best on validation photographs and on measured scenes
+FILTER_HZ = 5.0  # cutoff of that filter, chosen by --frames --split val at 5 frames a second
 SMALLEST_SHARE = 0.01  # of light behind a polarizer, of all
 FRAME_RATE_HZ = 30.0  # of the windows that `benchmark.warmup_windows` counts
 SENSORS: dict[str, tuple[str, ...]] = {
