@@ -1,7 +1,7 @@
 """All figures of a release from one commit: python -m studies.measure release --shared FOLDER --work FOLDER
 
     python -m studies.measure pipeline
-    python -m studies.measure run NAME DATA
+    python -m studies.measure paper DATA
 
 `release` runs every study whose section of docs/results names another commit than HEAD, one after the other, so that a
 run that was stopped goes on where it was; --only NAME ... takes some files alone. FOLDER of --shared holds the
@@ -10,9 +10,9 @@ photographs (data/rgb, data/rgb_more), the measured scenes (data/polarization, d
 docs/results/release.json gets the commit, the number of sections and of those from another commit, the lines of README
 and docs, and what README's installation downloads.
 
-`pipeline` times the demo in a fresh clone (docs/results/pipeline.json). `run` reads the simulated test set of a run of
-hours that was made by hand, in the folder DATA: NAME is `paper` for experiment=paper_small, `benchmark` for
-experiment=photographs with the rows of the table. All need a committed tree, because figures name a commit.
+`pipeline` times the demo in a fresh clone (docs/results/pipeline.json). `paper` reads the simulated test set of a run
+of experiment=paper_small in the folder DATA, which takes hours and is made by hand (docs/paper.md). All need a
+committed tree, because figures name a commit.
 """
 
 import argparse
@@ -57,8 +57,6 @@ STUDIES = {
 """Command by file and section of docs/results. Some write further sections of the same file."""
 INSTALL = ("-c", "constraints.txt", ".[recordings]")  # README's
 DEMO_METRICS = "data/benchmark/metrics.json"
-RUNS = {"paper": "paper_small", "benchmark": "simulated"}
-"""Section of docs/results/NAME.json that a finished run fills, by NAME."""
 
 
 def commits_of_results() -> dict[tuple[str, str], str]:
@@ -130,12 +128,12 @@ def minutes_of(target: str, folder: Path) -> float:
     return round((time.monotonic() - started) / 60, 2)
 
 
-def measure_run(name: str, data: Path) -> Path:
-    """Write docs/results/NAME.json from the simulated test set of a finished run in the folder `data`."""
+def measure_paper(data: Path) -> Path:
+    """Write paper.json from the simulated test set of a finished run of experiment=paper_small in the folder `data`."""
     folder = data / "benchmark" / "sets" / "simulated"
     details = json.loads((folder / "details.json").read_text(encoding="utf-8"))
     figures = {"scenes": len(details["scenes"]), "frames": details["frames"], "rows": scores_and_costs(folder)}
-    return write_section(name, RUNS[name], figures, machine_record())
+    return write_section("paper", "paper_small", figures, machine_record())
 
 
 def main() -> None:
@@ -147,9 +145,7 @@ def main() -> None:
     release.add_argument("--work", type=Path, required=True)
     release.add_argument("--only", nargs="+", metavar="NAME", help="files of docs/results (default: all)")
     kinds.add_parser("pipeline")
-    run = kinds.add_parser("run")
-    run.add_argument("name", choices=RUNS)
-    run.add_argument("data", type=Path)
+    kinds.add_parser("paper").add_argument("data", type=Path)
     arguments = parser.parse_args()
     if changed := uncommitted():
         parser.error(f"commit first, because the figures name a commit; changed:\n{changed}")
@@ -158,7 +154,7 @@ def main() -> None:
     elif arguments.kind == "pipeline":
         measure_pipeline()
     else:
-        measure_run(arguments.name, arguments.data.resolve())
+        measure_paper(arguments.data.resolve())
 
 
 if __name__ == "__main__":
