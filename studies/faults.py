@@ -2,8 +2,8 @@
 
 - artefacts: copies of the artefacts of a finished run are damaged, one after another, by one of FAULTS. Used as the
   next stage would, an artefact must be refused with one line that names the file or the folder, or give the same values
-  as before. --runs names projects with a finished run (`polarnet preset smoke`, then `dvc repro`); the first is
-  damaged, the others, such as one with seed=2, serve for exchanges.
+  as before. The run is the smoke pipeline in a clone; that of another seed serves for exchanges. --runs names other
+  projects with a finished run, of which the first is damaged.
 - kills: writers of stores are killed at a random rename. The old or the new one must be whole, a rerun must work.
 - names: commands read stores whose sequences have names that could be places elsewhere. They must refuse each.
 
@@ -21,6 +21,8 @@ import multiprocessing
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -51,6 +53,7 @@ REFUSALS = (ValueError, OSError, RuntimeError, MemoryError)  # what stages and c
 MAX_RENAMES = 51  # of `write_store` on an old store
 TEXTS = (".json", ".csv", "SHA256SUMS")
 FAILURES = ("unnamed", "traceback", "silent", "lost", "stuck", "outside")
+SEEDS = (1, 2)  # of the smoke runs
 OUTCOMES = ("refused", "harmless", *FAILURES[:4])
 Generator = np.random.Generator
 Fault = Callable[[Path, Sequence[Path], Generator], None]
@@ -312,8 +315,26 @@ def hostile_names() -> dict[str, dict[str, int]]:
     return counts
 
 
+def smoke_runs(folder: Path) -> list[Path]:
+    """Clones of HEAD below `folder`, each with a smoke run of another seed; CalledProcessError if one fails."""
+    runs = [folder / f"seed_{seed}" for seed in SEEDS]
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for seed, run in zip(SEEDS, runs, strict=True):
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(run)], check=True)
+        environment = os.environ | {"PATH": path, "PYTHONPATH": str(run)}
+        for command in ("polarnet preset smoke", f"dvc exp run --quiet --set-param seed={seed}"):
+            subprocess.run(command.split(), cwd=run, env=environment, check=True)
+    return runs
+
+
+def damaged_artefacts(given: argparse.Namespace) -> Mapping[str, Any]:
+    """Outcomes of each fault in the artefacts of `given.runs`, or of two smoke runs."""
+    with tempfile.TemporaryDirectory() as folder:
+        return inject(given.runs or smoke_runs(Path(folder)), given.faults, seed=1)[0]
+
+
 SECTIONS: dict[str, Callable[[argparse.Namespace], Mapping[str, Any]]] = {
-    "artefacts": lambda given: inject(given.runs, given.faults, seed=1)[0],
+    "artefacts": damaged_artefacts,
     "kills": lambda given: kills(given.kills),
     "names": lambda _: hostile_names(),
 }
@@ -335,7 +356,7 @@ def measure(name: str, given: argparse.Namespace) -> tuple[Mapping[str, Any], Ma
 
 if __name__ == "__main__":
     parser = command_line(__doc__, "docs/results/reliability.json")
-    parser.add_argument("--runs", type=Path, nargs="+", default=[ROOT], help="projects with finished runs")
+    parser.add_argument("--runs", type=Path, nargs="+", help="projects with finished runs")
     parser.add_argument("--faults", type=int, default=1000)
     parser.add_argument("--kills", type=int, default=100, help="of stores")
     sections = {name: ("reliability", name, functools.partial(measure, name)) for name in SECTIONS}
