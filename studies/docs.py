@@ -94,7 +94,7 @@ def records_of(root: Path) -> dict[str, Any]:
         sections = []
         for section, record in json.loads(path.read_text(encoding="utf-8")).get("records", {}).items():
             versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
-            units = record.get("bf16_units") or None  # older records do not have them
+            units = ", ".join(record["bf16_units"]) or "none"
             machine = {"machine": record["machine"], "cores": record["cores"], "units": units, "versions": versions}
             letter = chr(ord("A") + len(machines))
             letter = machines.setdefault(json.dumps(machine), {"letter": letter, **machine})["letter"]

@@ -27,7 +27,8 @@ without:
   caption: ""
 """
 BEFORE = "# title\n\n<!-- results:speed -->\n<!-- /results:speed -->\n\nafter\n"
-RECORD = {"machine": "Xeon", "cores": 2, "load": 0.5, "versions": {"torch": "2.13.0"}, "commit": "0123456789ab"}
+MACHINE = {"machine": "Xeon", "cores": 2, "bf16_units": []}
+RECORD = {**MACHINE, "load": 0.5, "versions": {"torch": "2.13.0"}, "commit": "0123456789ab"}
 CONSTANTS = ("zeros", "train_mean", "constant_real")
 MODELS = {"a": {"mse": 0.0251, "n": 1200, "gain": None}, "b": {"mse": 0.5}}
 
@@ -93,7 +94,7 @@ def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_
         rows = [line.split(" | ") for line in text.splitlines()[2:] if line.startswith("| ")]
         assert all(set(column) != {"-"} for column in zip(*rows, strict=True)), f"{name}: a column without any value"
     assert read_file(project, "records") == {
-        "machines": [{"letter": "A", "machine": "Xeon", "cores": 2, "units": None, "versions": "torch 2.13.0"}],
+        "machines": [{"letter": "A", "machine": "Xeon", "cores": 2, "units": "none", "versions": "torch 2.13.0"}],
         "measured": {"speed": "models: A, load 0.5, `0123456789`"},
     }
     listed = read_tables(project_root)["records"].rows.values()
