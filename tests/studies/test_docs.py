@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+import polarnet
 from studies.docs import block_text, read_file, read_tables, update_pages
 
 TABLES = """
@@ -99,6 +100,18 @@ def test_every_block_is_measured_and_shown_and_each_machine_listed_once(project_
     }
     listed = read_tables(project_root)["records"].rows.values()
     assert sorted(listed) == list(read_file(project_root, "records")["measured"])
+
+
+def test_every_table_of_figures_has_a_commit_and_those_of_a_release_have_the_same(project_root):
+    """Between releases, when the version ends in `.dev`, sections are measured one at a time."""
+    without_figures = ("records", "inspection", "paper_rows.yaml")
+    for name, table in read_tables(project_root).items():
+        if table.file not in without_figures:
+            assert table.section in read_file(project_root, table.file)["records"], name
+    files = [read_file(project_root, path.stem) for path in (project_root / "docs" / "results").glob("*.json")]
+    commits = {record["commit"] for file in files for record in file.get("records", {}).values()}
+    if ".dev" not in polarnet.__version__:
+        assert commits == {read_file(project_root, "release")["commit"]}
 
 
 @pytest.mark.parametrize(
