@@ -153,7 +153,9 @@ def _truth_of(options: argparse.Namespace) -> TrueFrames | None:
         return None
     path = options.input[0]
     if not is_store(path):
-        raise ValueError("--truth: expected an event store; leave out --truth")
+        inside = Path(path) / "events.zarr"  # of a simulation
+        advice = f"did you mean {inside}?" if is_store(str(inside)) else "leave out --truth"
+        raise ValueError(f"--truth: expected an event store, got {path}; {advice}")
     return truth_of(path, options.sequence or EventStore.open(path).sequences[0], options.truth)
 
 
@@ -175,7 +177,9 @@ def check_options(options: argparse.Namespace) -> None:
             raise ValueError(f"--live: {WHOLE_METHOD} waits for the whole recording; use --method {PAST_METHOD}")
     if options.live and len(options.input) != 1:
         raise ValueError(f"--live: expected one input, got {len(options.input)}")
-    if not first.is_dir() or is_recording(first):
+    if not options.live and is_store(options.input[0]):
+        refuse(options, "an event store", ["angles", "mosaic", *READING])
+    elif not first.is_dir() or is_recording(first):
         refuse(options, "a recording", ["sequence"])
     else:
-        refuse(options, "a store or a folder", READING)
+        refuse(options, "a folder", READING)

@@ -93,6 +93,8 @@ def _check(options: argparse.Namespace, inputs: list[str], overrides: list[str],
         h5py_module()  # where it is missing, say so before the simulation
     if len(inputs) != 1:
         raise ValueError(f"expected one picture, video or folder of frames before KEY=VALUE, got {len(inputs)}")
+    if (Path(inputs[0]) / "zarr.json").is_file():
+        raise ValueError(f"{inputs[0]}: expected a picture, a video or a folder of frames, got a store")
     if options.size and min(options.size) < 2:
         raise ValueError(f"--size: expected at least 2 rows and columns, got {options.size[0]} {options.size[1]}")
     if options.times and options.fps:

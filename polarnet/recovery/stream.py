@@ -89,7 +89,7 @@ def open_method(
     weights = weights or (shipped_weights() if method.shipped else setup.weights)
     setup = replace(setup, weights=weights)
     if reason := why_absent(method, setup):
-        raise ValueError(f"--method {method.name}: {reason}")
+        raise ValueError(f"--method {method.name}: {reason}; or name the file with --weights")
     recoverer = method.open(setup)
     whole = ", over the whole recording (--method ours: only the past)" if recoverer.between else ""
     if setup.frames is not None:

@@ -88,6 +88,7 @@ def test_nothing_usable_is_refused_in_words(project_root, tmp_path, monkeypatch,
     (empty / "letter.doc").write_text("Dear all")
     for scenes, given, words in (
         (empty, [], "found 0 pictures and 1 other files"),
+        (empty, ["--methods", "zeros,regstered"], "got 'regstered'; did you mean 'registered'?"),
         (empty / "letter.doc", [], "expected a folder of photographs or of measured polarization, got a file"),
     ):
         assert run(project_root, monkeypatch, scenes, out, *given) == 1

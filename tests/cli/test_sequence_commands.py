@@ -43,3 +43,5 @@ def test_truth_scores_a_recovery_and_reaches_its_video(simulated, tmp_path, caps
     (tmp_path / "e.txt").write_text("4 4\n1 2 3 1\n")
     assert main(["recover", str(tmp_path / "e.txt"), "--mosaic", "90 45 / 135 0", "--method", "cf", "--truth"]) == 1
     assert "--truth: expected an event store" in capsys.readouterr().err
+    assert main(["recover", str(simulated.events.parent), "--truth"]) == 1
+    assert f"did you mean {simulated.events}?" in capsys.readouterr().err

@@ -235,7 +235,7 @@ def test_interrupted_or_failed_runs_leave_an_earlier_run_and_nothing_else(tmp_pa
 def inputs(tmp_path_factory):
     """A folder of usable and unusable inputs."""
     folder = tmp_path_factory.mktemp("inputs")
-    for name in ("empty", "mine"):
+    for name in ("empty", "mine", "store"):
         (folder / name).mkdir()
     write_folder(folder / "walk", scenery(3))
     write_folder(folder / "mixed", scenery(3))
@@ -244,6 +244,7 @@ def inputs(tmp_path_factory):
         cv2.imwrite(str(folder / path), scenery(3, *size)[0])
     write_video(folder / "walk.mp4", scenery(3))
     texts = {"broken.mp4": "no video", "broken.png": "no picture", "mine/notes.txt": "keep", "soon.txt": "0\nsoon\n"}
+    texts |= {"store/zarr.json": "{}"}
     texts |= {f"{count}.txt": "\n".join(map(str, range(0, 10 * count, 10))) for count in (5, 7)}
     for name, text in (texts | {"s.txt": "0\n0.1\n0.2\n0.3\n0.4\n0.5\n"}).items():
         (folder / name).write_text(text)
@@ -260,6 +261,7 @@ FPS = ["--fps", "30"]
         (["broken.mp4"], "cannot open it as a video; convert it to MP4"),
         (["broken.png"], "cannot be read"),
         (["empty", *FPS], "expected the pictures of a clip, found none"),
+        (["store"], "store: expected a picture, a video or a folder of frames, got a store"),
         (["walk"], "give --fps HZ, --times FILE"),
         (["walk", "--times", "5.txt"], "expected a time for each of 6 frames, got 5"),
         (["walk.mp4", "--times", "7.txt"], "expected a time for each of 6 frames, got 7"),

@@ -131,7 +131,7 @@ def test_a_sequence_ends_with_its_last_event_and_is_replayed_as_lines(store, cha
 @pytest.mark.parametrize(("arguments", "reason"), [
     ((), "--sequence: expected a sequence of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
-    (("--sequence", "lake", "--method", "e2vid_published"), "no weights are given"),
+    (("--sequence", "lake", "--method", "e2vid_published"), "or name the file with --weights"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),
      "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
@@ -139,7 +139,8 @@ def test_a_sequence_ends_with_its_last_event_and_is_replayed_as_lines(store, cha
     (("--sequence", "lake", "--method", "cf", "--device", "cuda:9"), "sees no GPU"),
     (("--sequence", "lake", "--weights", "nothing.safetensors"), "nothing.safetensors: there is no such file"),
     (("--live", "--method", "cf", "--height", 70), "--live: expected no --height"),
-    (("--sequence", "lake", "--method", "cf", "--height", 8), "a store or a folder: expected no --height"),
+    (("--sequence", "lake", "--method", "cf", "--height", 8), "an event store: expected no --height"),
+    (("--mosaic", "90 45 / 135 0"), "an event store: expected no --mosaic, which does not apply to this input"),
     (("--sequence", "lake", "--angles", 0, 45, 90, 135), "one arrangement of polarizers, got --angles, --sequence"),
 ])  # fmt: skip
 def test_what_cannot_work_says_why(arguments, reason, store, tmp_path, at_root, capsys):
