@@ -244,9 +244,8 @@ def inputs(tmp_path_factory):
         cv2.imwrite(str(folder / path), scenery(3, *size)[0])
     write_video(folder / "walk.mp4", scenery(3))
     texts = {"broken.mp4": "no video", "broken.png": "no picture", "mine/notes.txt": "keep", "soon.txt": "0\nsoon\n"}
-    texts |= {"store/zarr.json": "{}"}
     texts |= {f"{count}.txt": "\n".join(map(str, range(0, 10 * count, 10))) for count in (5, 7)}
-    for name, text in (texts | {"s.txt": "0\n0.1\n0.2\n0.3\n0.4\n0.5\n"}).items():
+    for name, text in (texts | {"s.txt": "0\n0.1\n0.2\n0.3\n0.4\n0.5\n", "store/zarr.json": "{}"}).items():
         (folder / name).write_text(text)
     return folder
 
