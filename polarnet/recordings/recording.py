@@ -206,9 +206,8 @@ def detect_format(path: str | os.PathLike[str]) -> str:
     for name, form in FORMATS.items():
         if (name == "rosbag" or head) and form.matches(path, head):  # a bag may be a folder
             return name
-    raise RecordingError(
-        f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; if it is one of them, say which"
-    )
+    advice = "name a file in it" if path.is_dir() else "if it is one of them, name it as `format` (--format)"
+    raise RecordingError(f"{path.name}: its content is of none of the formats {', '.join(FORMATS)}; {advice}")
 
 
 def _packed(path: Path) -> bool:

@@ -49,9 +49,10 @@ def truth_formats() -> list[str]:
 
 def read_truth(path: Path, mosaic: Mosaic) -> Truth:
     """True polarization in a recording; RecordingError if it holds no frames, or frames whose times do not increase."""
-    read = FORMATS[detect_format(path)].frames
+    name = detect_format(path)
+    read = FORMATS[name].frames
     if read is None:
-        raise RecordingError(f"{path.name}: expected a format with frames, {', '.join(truth_formats())}")
+        raise RecordingError(f"{path.name}: expected a format with frames, {', '.join(truth_formats())}; got {name}")
     frames = read(path)
     if len(frames.t_us) > 1 and not (np.diff(frames.t_us) > 0).all():
         raise RecordingError(f"{path.name}: expected times of frames that increase; the file is damaged")

@@ -67,7 +67,7 @@ def test_a_recording_may_be_iterated_again_and_may_have_no_events(tmp_path, read
     [
         (b"", "the file is empty"),
         (b"\x00\x01\x02\xff" * 100, "of none of the formats e2p, esfp, metavision, monash, m3ed, mvsec, dsec, rosbag"),
-        (b"Dear reader,\nthis is a letter.\n", "of none of the formats"),
+        (b"Dear reader,\nthis is a letter.\n", r"if it is one of them, name it as `format` \(--format\)"),
         (b"1,2,3,4,5,6\n", "of none of the formats"),
     ],
 )
@@ -75,6 +75,8 @@ def test_content_of_no_known_format_is_refused_by_name(tmp_path, content, messag
     (tmp_path / "what.dat").write_bytes(content)
     with pytest.raises(RecordingError, match=rf"what\.dat: .*{message}"):
         read_recording(tmp_path / "what.dat")
+    with pytest.raises(RecordingError, match="name a file in it"):
+        read_recording(tmp_path)
 
 
 def test_a_format_that_is_named_is_taken_without_a_look_at_the_content(tmp_path):

@@ -113,5 +113,5 @@ def test_files_without_frames_say_what_they_lack(tmp_path, make_events):
     with pytest.raises(RecordingError, match="expected /frame_ts, and /frame or /intensity, /dolp, /aolp"):
         read_truth(tmp_path / "e.h5", MOSAIC)
     (tmp_path / "e.txt").write_text("4 4\n1 2 3 1\n")
-    with pytest.raises(RecordingError, match="expected a format with frames, e2p, aedat4, aedat2"):
+    with pytest.raises(RecordingError, match="expected a format with frames, e2p, aedat4, aedat2; got text"):
         read_truth(tmp_path / "e.txt", MOSAIC)
