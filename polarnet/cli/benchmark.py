@@ -20,7 +20,7 @@ from polarnet.cli.project import settings_root, working_folder
 from polarnet.cli.recorded import make_recorded_set
 from polarnet.config.pipeline import context_of, lpips_of, made_set, train_mean_of
 from polarnet.config.tree import Config, load
-from polarnet.methods import ROWS, is_rotating
+from polarnet.methods import is_rotating
 from polarnet.metrics.lpips import record_of
 from polarnet.networks.weights import shipped_weights
 from polarnet.pictures.manifest import read_manifest
@@ -33,7 +33,6 @@ from polarnet.simulation.sets import emulate_scenes, make_folder_set
 from polarnet.simulation.truth import motions_of
 from polarnet.stokes import parse_mosaic
 from polarnet.storage.scenes import SceneStore
-from polarnet.terminal.suggestions import did_you_mean
 
 PDAVIS = "90 45 / 135 0"
 PART = 2  # scenes
@@ -52,14 +51,11 @@ def run(options: argparse.Namespace) -> None:
     # all cores, and small parts, which share few scenes evenly among them; an override replaces both
     shared = [f"runtime.workers={usable_cores()}", f"storage.sequences_per_part={PART}"]
     chosen = [f"benchmark.methods=[{options.methods}]"] if options.methods else []
-    for word in options.methods.split(",") if options.methods else []:
-        if word not in ROWS:
-            raise ValueError(f"--methods: expected some of {', '.join(ROWS)}, got {word!r}{did_you_mean(word, ROWS)}")
     with contextlib.chdir(folder):  # paths of conf/config.yaml are relative to it
         config = load(settings_root(), [*shared, *options.overrides, *chosen], folder)
         configure(config.runtime, config.seed)
         notes = _score_folder(options, config, root, cleaning)
-    print(as_plain(read_results(options.out).table), "* the best value of a column", *notes, sep="\n")
+    print(as_plain(read_results(options.out).table), *notes, sep="\n")
     print(f"page: {options.out / 'index.html'}")
 
 

@@ -177,9 +177,9 @@ def check_options(options: argparse.Namespace) -> None:
             raise ValueError(f"--live: {WHOLE_METHOD} waits for the whole recording; use --method {PAST_METHOD}")
     if options.live and len(options.input) != 1:
         raise ValueError(f"--live: expected one input, got {len(options.input)}")
-    if not options.live and is_store(options.input[0]):
-        refuse(options, "an event store", ["angles", "mosaic", *READING])
-    elif not first.is_dir() or is_recording(first):
+    if not first.is_dir() or is_recording(first):
         refuse(options, "a recording", ["sequence"])
+    elif is_store(options.input[0]):
+        refuse(options, "an event store", ["angles", "mosaic", *READING])
     else:
         refuse(options, "a folder", READING)

@@ -17,6 +17,7 @@ from polarnet.cli.options import refuse
 from polarnet.cli.outputs import run_folder
 from polarnet.cli.project import settings_root, working_folder
 from polarnet.cli.simulated_files import FORMATS, STORE, Output, write_simulation
+from polarnet.cli.stores import is_store
 from polarnet.clips.video import moving_pieces, video_pieces
 from polarnet.config.tree import Config, load
 from polarnet.pictures.builtin import BUILTIN_PHOTOS
@@ -63,6 +64,8 @@ def simulate(options: argparse.Namespace) -> None:
     mosaic = parse_mosaic(options.mosaic) if options.mosaic else None
     size = options.size and tuple(options.size)
     path = Path(inputs[0]).resolve()
+    if is_store(str(path)):
+        raise ValueError(f"{inputs[0]}: expected a picture, a video or a folder of frames, got a store")
     clip = open_clip(path, ClipOptions(mosaic, options.white, options.grey, size))
     unused = ["times", "fps", "size", "upsample"] if clip.still else []
     unused.append("grey" if clip.measured else "white")
@@ -93,8 +96,6 @@ def _check(options: argparse.Namespace, inputs: list[str], overrides: list[str],
         h5py_module()  # where it is missing, say so before the simulation
     if len(inputs) != 1:
         raise ValueError(f"expected one picture, video or folder of frames before KEY=VALUE, got {len(inputs)}")
-    if (Path(inputs[0]) / "zarr.json").is_file():
-        raise ValueError(f"{inputs[0]}: expected a picture, a video or a folder of frames, got a store")
     if options.size and min(options.size) < 2:
         raise ValueError(f"--size: expected at least 2 rows and columns, got {options.size[0]} {options.size[1]}")
     if options.times and options.fps:

@@ -119,7 +119,7 @@ def score_table(
 
 
 def as_plain(table: Table) -> str:
-    """Aligned columns for a terminal, best values marked with an asterisk, notes below."""
+    """Aligned columns for a terminal, best values marked with an asterisk, what it means and notes below."""
     grid = [["", *(heading + " " for heading in table.headings)]]
     grid += [[row.label, *(cell.text + ("*" if cell.best else " ") for cell in row.cells)] for row in table.rows]
     widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
@@ -128,7 +128,7 @@ def as_plain(table: Table) -> str:
         for line in grid
     ]
     lines.insert(1, "-" * len(lines[0]))
-    return "\n".join([*(line.rstrip() for line in lines), *table.notes])
+    return "\n".join([*(line.rstrip() for line in lines), "* the best of its column", *table.notes])
 
 
 def _cells(column: Column, values: Sequence[float | int | None], ranked: Sequence[bool]) -> list[Cell]:

@@ -105,7 +105,10 @@ def test_a_measured_scene_smaller_than_the_window_is_skipped_and_named(project_r
     out = tmp_path / "out"
     assert run(project_root, monkeypatch, folder, out, "--methods", "zeros") == 0
     reason = "stamp.npz was skipped: a scene of 40x150 (height x width) is too small"
-    assert reason in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert reason in printed
+    assert "scenes: 1, plate-" in printed
+    assert "* the best of its column" in printed
     assert reason in (out / "index.html").read_text()
     scores = json.loads((out / "metrics.json").read_text())
     assert scores.keys() == {"zeros"}

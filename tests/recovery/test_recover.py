@@ -131,7 +131,9 @@ def test_a_sequence_ends_with_its_last_event_and_is_replayed_as_lines(store, cha
 @pytest.mark.parametrize(("arguments", "reason"), [
     ((), "--sequence: expected a sequence of lake, road; got None"),
     (("--sequence", "lake", "--method", "oracle_mean"), "expected a method of cf"),
-    (("--sequence", "lake", "--method", "e2vid_published"), "or name the file with --weights"),
+    (("--sequence", "lake", "--method", "e2vid_published"),
+     "no weights are given: add the row to section `rows` of params.yaml, with their file as "
+     "rows.e2vid_published.needs; or name the file with --weights"),
     (("--sequence", "lake", "--method", "cf", "--window", "1s"),
      "events.zarr lasts 100 ms, less than one window of 1000 ms: record for longer, or give --window 33.333ms"),
     (("--sequence", "lake", "--method", "cf", "--step", "9ev"), "expected a time such as 0.1ms"),
