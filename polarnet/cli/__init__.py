@@ -3,7 +3,6 @@
 import argparse
 import shlex
 import sys
-import warnings
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -33,7 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"polarnet {words[0]}: {error or type(error).__name__}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        warnings.simplefilter("ignore", RuntimeWarning)  # about a call of Zarr that was to start
         print(f"polarnet {words[0]}: {STOPPED}", file=sys.stderr)
         return INTERRUPTED
     return status or 0

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+import warnings
 from types import FrameType, TracebackType
 
 INTERRUPTED = 130  # exit status of shells after Ctrl-C
@@ -33,9 +34,16 @@ def announce_interrupts() -> None:
         else:
             sys.__excepthook__(kind, error, trace)
 
+    def end(failure: "sys.UnraisableHookArgs") -> None:
+        if failure.exc_type is KeyboardInterrupt:  # it fell into a destructor, where Python would drop it
+            print(STOPPED, file=sys.stderr)
+            os._exit(INTERRUPTED)
+
     def interrupt(number: int, frame: FrameType | None) -> None:
         first = time.monotonic()
         signal.signal(signal.SIGINT, lambda *_: time.monotonic() > first + UNWINDING_S and os._exit(INTERRUPTED))
+        sys.unraisablehook = end  # quiet about what the interrupt leaves half made, such as an event loop of Zarr
+        warnings.simplefilter("ignore", RuntimeWarning)  # and about a coroutine of Zarr that was to start
         raise KeyboardInterrupt
 
     sys.excepthook = hook

@@ -85,3 +85,31 @@ def test_a_second_interrupt_ends_only_what_hangs_after_the_first(tmp_path, proje
         output, error = process.communicate(timeout=30)
     assert output == ("unwound\n" if unwound else "")
     assert error == (f"{STOPPED}\n" if unwound else "")
+
+
+HALF_MADE = """
+import sys, time
+from polarnet.terminal.environment import announce_interrupts
+announce_interrupts()
+def reach(place):
+    if place == sys.argv[2]:
+        open(sys.argv[1], "w").close()
+        time.sleep(60)
+class Loop:
+    def __init__(self):
+        reach("construction")
+        self.socket = "open"
+    def __del__(self):
+        reach("destruction")
+        del self.socket
+loop = Loop()
+del loop
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("place", ["construction", "destruction"])
+def test_an_interrupt_in_a_constructor_or_destructor_ends_the_program_in_one_line(tmp_path, project_root, place):
+    started = tmp_path / "started"
+    command = [sys.executable, "-c", HALF_MADE, str(started), place]
+    assert interrupted(command, tmp_path, started.exists, project_root) == (130, f"{STOPPED}\n")
