@@ -20,14 +20,17 @@ FIRST = (
     "networks/test_onnx_export.py",
     "methods/test_methods.py",
     "config/test_config.py",
+    "config/test_origins.py",
     "cli/test_simulate.py",
+    "recordings/test_fuzz.py",
+    "recovery/test_recover.py",
     "cli/test_benchmark_command.py",
     "benchmark/test_recorded.py",
     "reference/test_golden.py",
     "captures/test_rig.py",
     "characterization/test_fit.py",
 )
-"""Files that workers take first: one compiles the pixel models, the next seven need none of them, then the slowest.
+"""Files that workers take first: one compiles the pixel models, the next eight need none of them, then the slowest.
 
 So no two workers compile one kernel at once, and none is left with a long file when the rest is done.
 """

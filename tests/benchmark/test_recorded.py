@@ -62,6 +62,7 @@ def recording(made):
     return path
 
 
+@pytest.mark.thorough
 def test_every_kind_of_method_has_its_row_and_the_truth_is_that_of_the_files(
     made, checkpoints, project_root, tmp_path, monkeypatch, capsys
 ):

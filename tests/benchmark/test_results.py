@@ -26,6 +26,7 @@ def written(folder, benchmark, rows=ROWS):
     return {row: folder / row for row in rows}
 
 
+@pytest.mark.thorough
 def test_rows_that_ran_alone_give_the_table_of_one_run_to_the_last_digit(five_scenes, context, benchmark, tmp_path):
     folders = {}
     for row in ROWS:

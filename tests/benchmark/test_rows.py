@@ -27,6 +27,7 @@ def test_all_rows_of_one_sequence_come_in_the_order_asked_for(sequence, context)
         assert torch.equal(prediction.dolp, dolp_of(row, sequence, context)), row
 
 
+@pytest.mark.thorough
 def test_only_the_oracle_looks_at_the_truth(sequence, context):
     blind = dataclasses.replace(sequence, dolp=torch.full_like(sequence.dolp, 0.5))
     seen, unseen = (predictions_of(WITH_WEIGHTS_HERE, one, context) for one in (sequence, blind))

@@ -20,6 +20,8 @@ from polarnet.storage.events import EventStore
 from polarnet.storage.frames import FrameStore
 from studies.simulated_rig import PICTURE_RATE_HZ, RigConfig, write_rig
 
+pytestmark = pytest.mark.thorough
+
 SMALL = {"enabled": True, "sensor": [96, 160], "region": [24, 2], "negative_events": 24, "crop": [64, 96],
          "size": [16, 24]}  # fmt: skip
 RIG = RigConfig(speed_px_s=80.0, longest_delay_s=0.25, duration_s=0.3, hot_pixels=3)

@@ -51,6 +51,7 @@ def fit(static, flickers):
     return fit_sensor(static, 200.0, flickers, SENSORS["default"])
 
 
+@pytest.mark.thorough
 def test_a_static_and_two_flicker_recordings_give_the_sensor_and_its_hot_pixels(fit, static):
     tolerances = {
         "contrast_threshold_on": 0.03, "contrast_threshold_off": 0.03, "contrast_threshold_sigma_on": 0.12,
@@ -65,6 +66,7 @@ def test_a_static_and_two_flicker_recordings_give_the_sensor_and_its_hot_pixels(
     assert fit.estimates["hot_pixel_rate_hz"].value == pytest.approx(60.0, rel=0.02)
 
 
+@pytest.mark.thorough
 def test_what_the_recordings_do_not_show_is_missing(static, flickers):
     fit = fit_sensor(static, 200.0, [], SENSORS["default"])
     assert fit.missing["contrast_threshold_on"] == "needs a flicker recording"
@@ -74,6 +76,7 @@ def test_what_the_recordings_do_not_show_is_missing(static, flickers):
     assert fit.missing["shot_noise_rate_hz"] == "needs a static recording"
 
 
+@pytest.mark.thorough
 def test_a_flicker_given_as_static_is_noted_and_another_sensor_refused(fit, flickers, static):
     assert not any("constant" in note for note in fit.notes)
     assert "was not constant" in fit_sensor(flickers[0][0], 200.0, [], SENSORS["default"]).notes[0]

@@ -35,6 +35,7 @@ def run(project_root, monkeypatch, scenes, out, *arguments):
     return main(["benchmark", "--scenes", str(scenes), "--out", str(out), *arguments, *TINY, *paths])
 
 
+@pytest.mark.thorough
 def test_a_folder_of_photographs_is_scored_with_given_weights(
     photographs, checkpoints, project_root, tmp_path, monkeypatch, capsys
 ):

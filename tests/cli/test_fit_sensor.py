@@ -79,6 +79,7 @@ def test_options_that_do_not_fit_are_refused_with_a_remedy(folder, capsys, argum
     assert not (folder / "conf").exists()
 
 
+@pytest.mark.thorough
 def test_outside_a_clone_the_sensor_works_in_the_folder_where_it_was_fitted(folder, capsys):
     assert main([*FIT, "--name", "mine", *FLICKER]) == 0
     cv2.imwrite("photo.png", np.random.default_rng(1).integers(0, 256, (60, 80, 3), np.uint8))

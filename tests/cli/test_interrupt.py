@@ -68,6 +68,7 @@ finally:
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("seconds", "unwound"), [(1.0, True), (60.0, False)])
 def test_a_second_interrupt_ends_only_what_hangs_after_the_first(tmp_path, project_root, seconds, unwound):
     started, ending = tmp_path / "started", tmp_path / "ending"

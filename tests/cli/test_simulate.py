@@ -194,6 +194,7 @@ def test_sizes_polarizers_readout_and_upsampling_are_those_of_the_python_call():
     assert zarr.open_group("out/truth.zarr", mode="r")["t_us"][:].tolist() == T_US
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("form", "suffix"), [("hdf5", "h5"), ("text", "txt"), ("evt3", "raw")])
 def test_files_for_other_tools_read_back_equal_one_a_sensor(form, suffix, capsys):
     write_video("walk.mp4", scenery(3))

@@ -174,6 +174,7 @@ def test_the_error_names_the_keys_that_ask_for_lpips_and_no_others(project_root,
     check_lpips(load(project_root, ["benchmark.lpips=false", *without]))
 
 
+@pytest.mark.thorough
 def test_every_preset_composes_holds_only_what_differs_and_no_sensor_is_called_like_an_experiment(project_root):
     whole = dataclasses.asdict(load(project_root))
     for group in GROUPS:

@@ -56,6 +56,7 @@ def test_equal_values_are_accepted_and_a_changed_one_names_key_both_values_and_t
     assert "`python -m stages.emulate emulate.contrast_threshold_on=0.4`" in text
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("override", "key"),
     [
@@ -98,6 +99,7 @@ def test_an_origin_holds_the_values_of_an_artefact_and_its_inputs_and_others_are
     assert origin.inputs == {"data/scenes.zarr": digest(tmp_path / "data" / "scenes.zarr")}
 
 
+@pytest.mark.thorough
 def test_an_artefact_in_anothers_place_or_of_another_run_is_refused(run, tmp_path):
     make_all(run, *SIMULATION, "train", "row")
     data = tmp_path / "data"

@@ -85,6 +85,7 @@ def test_an_offset_of_each_line_along_the_motion_is_found_and_noise_is_not():
     assert found[1].std() < 0.05
 
 
+@pytest.mark.thorough
 def test_a_whole_recording_gives_better_maps_than_the_past_alone(simulated, windows, open_shipped):
     errors = {}
     for name in ("ours", "registered"):
@@ -150,6 +151,7 @@ def frames_at(simulated, places):
     return StokesFrames(simulated.t_us.numpy()[places], stokes.float(), valid)
 
 
+@pytest.mark.thorough
 def test_what_frames_show_is_carried_along_the_motion_and_frames_of_another_time_change_nothing(
     simulated, windows, open_shipped
 ):
@@ -167,6 +169,7 @@ def test_what_frames_show_is_carried_along_the_motion_and_frames_of_another_time
     assert maps["frames"].log_variance.exp().mean() < 0.5 * maps["none"].log_variance.exp().mean()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("with_frames", [False, True])
 def test_maps_between_the_ends_of_windows_are_as_good_as_those_at_the_ends(simulated, open_shipped, with_frames):
     ends, middles = simulated.t_us[::2], simulated.t_us[1::2]

@@ -32,6 +32,7 @@ def test_alexnet_and_vgg_give_the_values_of_the_program_that_their_weights_come_
     )
 
 
+@pytest.mark.thorough
 def test_in_bf16_the_distance_is_within_a_percent(installed):
     pair = astronaut(7)
     with torch.autocast("cpu", torch.bfloat16):

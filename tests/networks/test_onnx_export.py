@@ -89,6 +89,7 @@ def program_in(path: Path) -> Callable[..., list[torch.Tensor]]:
     return run
 
 
+@pytest.mark.thorough
 def test_onnx_runtime_gives_what_torch_gives_window_after_window_and_one_weight_that_is_off_is_detected(written):
     equal = "ONNX Runtime's outputs equal torch's within 0.0001"
     assert re.search(rf"polarnet\.onnx, 0\.\d MB; {equal}\n", written.printed)
@@ -103,6 +104,7 @@ def test_onnx_runtime_gives_what_torch_gives_window_after_window_and_one_weight_
         check_program(program_in(written.path), network, windows)
 
 
+@pytest.mark.thorough
 def test_the_file_says_what_it_takes_and_nothing_of_its_machine(written):
     path, checkpoint, _ = written
     session = onnxruntime.InferenceSession(path)
@@ -120,6 +122,7 @@ def test_the_file_says_what_it_takes_and_nothing_of_its_machine(written):
     assert b".py" not in path.read_bytes()  # nothing of the machine that wrote it
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("difference", [0.1, float("nan")])
 def test_a_file_that_differs_from_torch_is_not_left_behind(written, tmp_path, monkeypatch, capsys, difference):
     right = program_in(written.path)
@@ -167,6 +170,7 @@ def test_without_the_packages_the_extra_is_named(tmp_path, monkeypatch, capsys):
         assert f"ONNX files need {absent}: run pip install -e '.[export]' in the clone" in said
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("written", [POLARNET_IS_SLOW], indirect=True)
 def test_the_lines_on_the_page_run_as_they_stand(written, monkeypatch, project_root):
     monkeypatch.chdir(written.path.parent)

@@ -132,6 +132,7 @@ def append(file: Path) -> None:
     file.write_text(file.read_text() + "\nCHANGED = True\n" if file.exists() else "NEW = True\n")
 
 
+@pytest.mark.thorough
 def test_a_second_run_has_nothing_to_do_nor_one_after_changes_that_no_stage_reads(project):
     for file in ("terminal/progress.py", "cli/doctor.py"):
         append(project / "polarnet" / file)
@@ -157,6 +158,7 @@ thorough = functools.partial(pytest.param, marks=pytest.mark.thorough)
 FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
@@ -185,6 +187,7 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
     return lambda params: functools.reduce(operator.getitem, section.split("."), params).update(values)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("change", "stages"),
     [
@@ -202,6 +205,7 @@ def test_a_changed_value_runs_what_it_can_change(project, change, stages):
     assert repro() == stages
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("file", "values", "stages"),
     [

@@ -56,6 +56,7 @@ def ending(path: Path, form: str | None, size: int) -> str:
     return "repaired" if any(reader.repairs.values()) else "read"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", FORMATS)
 def test_a_damaged_file_ends_in_events_or_in_the_reason(form, tmp_path, make_random_events):
     path = tmp_path / f"sample{FILES[form][0]}"

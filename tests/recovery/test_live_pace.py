@@ -70,6 +70,7 @@ def method(clock, work_s, taken):
     return Recoverer(lambda height, width: None, predict, at_once=lambda height, width: 1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("step_us", "windows", "work_s"),
     [

@@ -244,6 +244,7 @@ def test_a_sensor_of_one_row_or_column_is_refused(height, width, tmp_path, monke
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_an_hour_of_live_input_with_a_wrong_clock_loses_the_events_that_the_warning_names(tmp_path, capsys, at_root):
     """Stale events, late ones, a wrong time, a pause of two minutes, a reset and a jump of two hours; 100 events/s."""
     minute_us = 60_000_000

@@ -103,6 +103,7 @@ def picture(page, role):
     return page.evaluate(f"document.querySelector('[data-role={role}] canvas').toDataURL()")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["report", "viewer"])
 def test_the_page_works_alone_cuts_nothing_off_in_light_or_dark_and_axe_finds_no_serious_fault(browser, files, name):
     pytest.importorskip("axe_playwright_python", reason="pip install axe-playwright-python")

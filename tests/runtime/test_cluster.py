@@ -124,12 +124,14 @@ def cluster():
         yield cluster
 
 
+@pytest.mark.thorough
 def test_a_dask_cluster_gives_the_same_results_and_loses_nothing_with_a_killed_worker(cluster, tmp_path):
     items = [(str(tmp_path / "died"), value) for value in range(6)]
     assert pmap(die_once, items, workers=1, label="values", address=cluster.scheduler_address) == list(range(6))
     assert (tmp_path / "died").exists()
 
 
+@pytest.mark.thorough
 def test_a_dask_scheduler_that_ends_is_an_error(cluster, tmp_path):
     def end() -> None:
         until(lambda: list(tmp_path.iterdir()))

@@ -92,6 +92,7 @@ def test_the_normal_quantile_is_right_from_tail_to_tail():
     assert stats.kstest(normal_map(np.uint64(3), 1, 0, 20_000), "norm").pvalue > 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", ["v2e", "exact"])
 def test_the_photoreceptor_s_noise_fires_on_and_off_in_turns_as_often_as_in_v2e_s_program(model):
     """v2e's program (commit cac6384): 0.208 and 0.214 events of each sign per second for a deviation of 0.0551.

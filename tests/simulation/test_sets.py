@@ -65,6 +65,7 @@ def test_a_set_that_was_interrupted_goes_on(photographs, tmp_path, recipe):
     assert (folder / "frames.zarr" / "zarr.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("pattern", ["images/*.png", "frames.zarr/part-00000/dolp/c/0/0/0", MADE])
 def test_a_set_with_a_damaged_file_is_made_again(photographs, tmp_path, recipe, caplog, pattern):
     folder = tmp_path / "set"

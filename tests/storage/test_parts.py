@@ -193,6 +193,7 @@ class Killed(BaseException):
     """Stands for SIGKILL: zarr, which cleans up after an Exception, gets no chance to."""
 
 
+@pytest.mark.thorough
 def test_whichever_rename_a_writer_dies_before_the_rerun_ends_with_the_same_bytes(tmp_path, monkeypatch):
     """Zarr renames each file that it has written, so that these are the moments between any two files."""
     path, moves, deaths = tmp_path / "store.zarr", {"replace": os.replace, "rename": os.rename}, 0

@@ -44,6 +44,7 @@ def run(project_root, tmp_path):
     return tmp_path
 
 
+@pytest.mark.thorough
 def test_no_fault_is_used_silently_and_every_refusal_names_the_file(run):
     counts, bad = faults.inject([run], FAULTS, seed=1)
     bad = [line for line in bad if ": sealed again of" not in line]  # which only the origin of a stage reveals
@@ -62,5 +63,6 @@ def test_without_checks_silent_uses_are_counted(run, monkeypatch):
     assert silent == sum(line.startswith("silent") for line in bad) > 0
 
 
+@pytest.mark.thorough
 def test_killed_writers_leave_the_old_or_the_new_result():
     assert faults.kills(3) == {"kill of a store": {"whole": 3, "lost": 0, "stuck": 0}}

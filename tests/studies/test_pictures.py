@@ -18,6 +18,7 @@ def test_the_pictures_together_stay_small(project_root):
     assert sum(path.stat().st_size for path in (project_root / "docs" / "pictures").iterdir()) < 1_100_000
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("sensor", "largest", "rms"), [(FINE, 0.01, 0.01), (SENSORS["default"], 0.1, 0.01)])
 def test_a_dofp_sensor_is_calibrated_from_its_own_events_to_1_percent(sensor, largest, rms):
     """For the default sensor, with its noise, mismatch and thresholds, in the mean over pixels."""

@@ -48,6 +48,7 @@ def test_a_folder_with_a_manifest_has_a_source_for_each_repo(tmp_path):
     assert sources_of(tmp_path, tmp_path) == {tmp_path.name: tmp_path}
 
 
+@pytest.mark.thorough
 def test_every_sensor_but_the_default_changes_the_configuration():
     default = settings()
     assert [name for name, overrides in SENSORS.items() if settings(*overrides) == default] == ["default"]

@@ -155,6 +155,7 @@ def test_a_training_shows_its_progress_and_another_starts_from_its_weights_but_n
     assert all(torch.equal(begun[name], tensors[name]) for name in others)
 
 
+@pytest.mark.thorough
 def test_a_training_ends_with_it_even_if_killed_before(stores, tmp_path, task_of):
     whole = files_of(run(task_of(), stores, tmp_path / "whole", TRAIN))
     killed(task_of(), 16, stores, tmp_path / "killed", TRAIN)

@@ -98,7 +98,8 @@ def killed(task: Task, at: int, stores: tuple[Path, Path], folder: Path, config:
         run(dataclasses.replace(task, unroll=unroll), stores, folder, config)
 
 
-@pytest.mark.parametrize("killed_at", [*(pytest.param(step, marks=pytest.mark.thorough) for step in (8, 9)), 12])
+@pytest.mark.thorough
+@pytest.mark.parametrize("killed_at", [8, 9, 12])
 def test_a_training_killed_at_any_step_ends_as_if_undisturbed(stores, tmp_path, undisturbed, killed_at):
     """Each of two epochs has eight steps, validation included."""
     killed(small_task(), killed_at, stores, tmp_path)
@@ -141,6 +142,7 @@ def test_worker_processes_change_nothing(stores, tmp_path, undisturbed):
     assert files_of(run(small_task(), stores, tmp_path, workers=2)) == undisturbed
 
 
+@pytest.mark.thorough
 def test_one_sequence_can_be_learnt_by_heart(stores, tmp_path):
     config = dataclasses.replace(
         TRAIN, epochs=20, batch_size=1, bptt_windows=2, learning_rate=1e-2, windows=None, crop=None, symmetries=False

@@ -72,6 +72,7 @@ def test_values_and_arrays_come_from_one_process_that_is_not_ours_also_for_two_t
     assert sizes == [0, 0, 1, 1, 2, 2]
 
 
+@pytest.mark.thorough
 def test_a_script_without_a_guard_runs_once_and_leaves_no_process_and_no_pipe_open(project_root):
     Path("script.py").write_text(
         "from pathlib import Path\n"
