@@ -56,10 +56,7 @@ def save_small(name: str, folder: Path) -> Path:
     return folder / f"{name}.safetensors"
 
 
-POLARNET_IS_SLOW = pytest.param("polarnet", marks=pytest.mark.thorough)
-
-
-@pytest.fixture(scope="module", params=["paper", POLARNET_IS_SLOW])
+@pytest.fixture(scope="module", params=["paper", "polarnet"])
 def written(request, tmp_path_factory) -> Written:
     """Tracing takes seconds, so each network is written once, without the shape checks, which make it slower."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -171,7 +168,7 @@ def test_without_the_packages_the_extra_is_named(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("written", [POLARNET_IS_SLOW], indirect=True)
+@pytest.mark.parametrize("written", ["polarnet"], indirect=True)
 def test_the_lines_on_the_page_run_as_they_stand(written, monkeypatch, project_root):
     monkeypatch.chdir(written.path.parent)
     snippet = re.search(r"```python\n(.*?)```", (project_root / "docs" / "network.md").read_text(), re.DOTALL)

@@ -154,7 +154,6 @@ def test_a_new_trained_baseline_trains_itself_and_no_other_training(project):
     assert repro() == {"train_baseline@sobel", "benchmark@sobel", "report", "emulate_rotating"} | ROWS
 
 
-thorough = functools.partial(pytest.param, marks=pytest.mark.thorough)
 FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 
 
@@ -162,15 +161,15 @@ FROM_SIMULATION = {*SIMULATION, "sets", "emulate_rotating", "report"}
 @pytest.mark.parametrize(
     ("file", "stages"),
     [
-        thorough("methods/overlap.py", ROWS | {"report"}),
-        thorough("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
-        thorough("networks/e2v/network.py", {"train_baseline@e2v", "report"} | ROWS),
-        thorough("networks/registry.py", {"report"} | ROWS),
-        thorough("training/dolp.py", {"train"}),
-        thorough("simulation/pixels/exact.py", (FROM_SIMULATION | ROWS) - {"ingest"}),
-        thorough("metrics/similarity.py", {"report"} | TRAININGS | ROWS),
-        thorough("reports/figures.py", {"calibrate", "report"}),
-        thorough("benchmark/results.py", {"report"} | ROWS),
+        ("methods/overlap.py", ROWS | {"report"}),
+        ("networks/polarnet/panorama.py", {"train", "report"} | ROWS),
+        ("networks/e2v/network.py", {"train_baseline@e2v", "report"} | ROWS),
+        ("networks/registry.py", {"report"} | ROWS),
+        ("training/dolp.py", {"train"}),
+        ("simulation/pixels/exact.py", (FROM_SIMULATION | ROWS) - {"ingest"}),
+        ("metrics/similarity.py", {"report"} | TRAININGS | ROWS),
+        ("reports/figures.py", {"calibrate", "report"}),
+        ("benchmark/results.py", {"report"} | ROWS),
     ],
 )
 def test_a_changed_file_runs_what_it_can_change(project, file, stages):
@@ -192,12 +191,12 @@ def put(section: str, **values: Any) -> Callable[[Any], None]:
     ("change", "stages"),
     [
         (put("methods.gain", rounds=3), OF_ALL_METHODS | {"report"}),
-        thorough(put("baselines.e2v", epochs=2), {"train_baseline@e2v", "report"}),
-        thorough(put("methods.cf", cutoff_hz=1.0), OF_ALL_METHODS | {"benchmark@cf", "report"}),
-        thorough(put("loss", mse=12.0), {"train", "report"}),
-        thorough(put("benchmark", bootstrap_samples=100), {"report"}),
-        thorough(put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"}),
-        thorough(lambda params: params["rows"].pop("highpass"), {"emulate_rotating", "report"}),
+        (put("baselines.e2v", epochs=2), {"train_baseline@e2v", "report"}),
+        (put("methods.cf", cutoff_hz=1.0), OF_ALL_METHODS | {"benchmark@cf", "report"}),
+        (put("loss", mse=12.0), {"train", "report"}),
+        (put("benchmark", bootstrap_samples=100), {"report"}),
+        (put("emulate", cutoff_hz=200.0), {"emulate", "sets", "emulate_rotating", "report"}),
+        (lambda params: params["rows"].pop("highpass"), {"emulate_rotating", "report"}),
     ],
 )  # fmt: skip
 def test_a_changed_value_runs_what_it_can_change(project, change, stages):
@@ -210,7 +209,7 @@ def test_a_changed_value_runs_what_it_can_change(project, change, stages):
     ("file", "values", "stages"),
     [
         ("data/external/start/net.safetensors", put("train", start="data/external/start/net.safetensors"), {"train"}),
-        thorough("weights/e2v.pth", put("rows.e2v", needs="weights/e2v.pth"), {"benchmark@e2v"}),
+        ("weights/e2v.pth", put("rows.e2v", needs="weights/e2v.pth"), {"benchmark@e2v"}),
     ],
 )
 def test_new_content_of_a_file_that_a_value_names_runs_the_stage_that_reads_it(project, file, values, stages):
